@@ -59,14 +59,16 @@ class Compare(Reading):
 
     def _cameras(self, *both: tuple[Camera, Camera | None]) -> None:
         """Compare two cameras."""
-        from evflow.camera.optics import read_known
+        from evflow.camera.optics import read_known, read_sensor
         from evflow.metrics.cameras import compare_cameras, verdict
         from evflow.report.cameras import describe_cameras, write_cameras
 
         self._check_targets()
         (a, a_std), (b, b_std) = both
-        numbers = compare_cameras(a, b, a_std, b_std, a_known=read_known(self.real),
-                                  b_known=read_known(self.synthetic))
+        numbers = compare_cameras(
+            a, b, a_std, b_std, a_known=read_known(self.real), b_known=read_known(self.synthetic),
+            a_by_light=read_sensor(self.real)[0].cutoff_by_light,
+            b_by_light=read_sensor(self.synthetic)[0].cutoff_by_light)
         if a.shape != b.shape:
             print(f"note: their maps are {a.shape} and {b.shape}: they are not compared pixel by "
                   "pixel.", file=sys.stderr)

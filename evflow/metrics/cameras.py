@@ -9,9 +9,12 @@ import numpy as np
 
 from evflow.camera import PARAMETERS, Camera
 from evflow.errors import EvflowDataError
+from evflow.light.log_maps import normalised_intensity
 
 APART = 3.0  # standard deviations: larger differences are certain
 FLOOR = 0.01  # relative: least error of a value
+GREY = 128.0  # DN at which two cutoffs are compared that depend on light in different ways
+WHITE = 255.0  # DN of a cutoff that is proportional to light
 WHOLE = ("sigma_on", "sigma_off", "cutoff_hz", "refractory_s", "leak_hz", "shot_hz")  # no maps
 
 Known = Mapping[str, tuple[float, float]]
@@ -20,6 +23,7 @@ Known = Mapping[str, tuple[float, float]]
 def compare_cameras(
     a: Camera, b: Camera, a_std: Camera | None = None, b_std: Camera | None = None, *,
     a_known: Known | None = None, b_known: Known | None = None,
+    a_by_light: bool = True, b_by_light: bool = True,
 ) -> dict[str, dict[str, float | None]]:
     """JSON-ready numbers of two cameras of maps (H, W), by parameter.
 
@@ -27,13 +31,17 @@ def compare_cameras(
         a, b: the cameras.
         a_std, b_std: standard deviations of their pixels.
         a_known, b_known: camera-wide values and errors (`read_known`).
+        a_by_light, b_by_light: whether their cutoffs are proportional to light and given at 255
+            DN, or the same in any light (`SensorModel.cutoff_by_light`).
 
     Returns:
         By parameter: a, b, the known value, else the median of the map; a_std, b_std, its standard
         deviation, else that of the median pixel, as errors of pixels are mostly shared; their
         ratio b / a; error, std of the difference; apart, the difference in units of it; r,
         correlation over the pixels. None where a value is unknown, a map does not vary, or sizes
-        differ.
+        differ. Of cutoff_hz also at_dn, the light in DN at which both are given: 255, or None
+        where they are the same in any light, or 128 if one of them is proportional to light and
+        the other is not; and a_by_light, b_by_light: 1 or 0, or None where it was not measured.
 
     Raises:
         EvflowDataError: EV002 for maps of several cameras.
@@ -50,9 +58,30 @@ def compare_cameras(
         r = float(np.corrcoef(maps[0].ravel(), maps[1].ravel())[0, 1]) if varies else None
         found[name] = {**row, "r": r if row["a"] is not None and row["b"] is not None else None}
     for name in WHOLE:
-        if name in (a_known or {}) or name in (b_known or {}):
-            found[name] = {**_one((a_known or {}).get(name), (b_known or {}).get(name)), "r": None}
+        pair = (a_known or {}).get(name), (b_known or {}).get(name)
+        if pair != (None, None):
+            found[name] = {**(_cutoffs(pair, (a_by_light, b_by_light)) if name == "cutoff_hz"
+                              else _one(*pair)), "r": None}
     return found
+
+
+def _cutoffs(
+    pair: tuple[tuple[float, float] | None, tuple[float, float] | None], by_light: tuple[bool, bool]
+) -> dict[str, float | None]:
+    """The row of two cutoffs, at one light where their laws differ."""
+    laws = [law if one else None for one, law in zip(pair, by_light, strict=True)]
+    at = GREY if {True, False} <= {*laws} else WHITE if True in laws else None
+    scale = normalised_intensity(GREY) if at == GREY else 1.0
+    a, b = ((one[0] * scale, one[1] * scale) if one and law else one
+            for one, law in zip(pair, laws, strict=True))
+    return {**_one(a, b), "at_dn": at, **{f"{side}_by_light": None if law is None else float(law)
+                                          for side, law in zip("ab", laws, strict=True)}}
+
+
+def said_of_cutoff(row: Mapping[str, float | None]) -> str:
+    """The light at which the cutoffs of a row are given, in words."""
+    at = row["at_dn"]
+    return "in any light" if at is None else f"at {at:g} DN"
 
 
 def _value(

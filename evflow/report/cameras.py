@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from evflow.camera import Camera
-from evflow.metrics.cameras import verdict
+from evflow.metrics.cameras import GREY, said_of_cutoff, verdict
 from evflow.report import page
 from evflow.report.figures import svg
 from evflow.report.page import Panel, figure, grid, number, paragraph, spread, table
@@ -28,12 +28,12 @@ NOTE = ("Apart: the difference in standard deviations; above 3 they differ. r: "
 def describe_cameras(numbers: dict[str, Any], names: tuple[str, str]) -> str:
     """One line per parameter, and which ones certainly differ."""
     rows = [["", *(name[:24] for name in names), "ratio", "apart", "r"], *(
-        [name, _shown(row, "a"), _shown(row, "b"), number(row["ratio"]), _signed(row["apart"]),
-         number(row["r"], 2)] for name, row in numbers.items())]
+        [_named(name, row, name), _shown(row, "a"), _shown(row, "b"), number(row["ratio"]),
+         _signed(row["apart"]), number(row["r"], 2)] for name, row in numbers.items())]
     widths = [max(len(row[i]) for row in rows) for i in range(6)]
     lines = ["  ".join(cell.ljust(w) if not i else cell.rjust(w) for i, (cell, w) in enumerate(
         zip(row, widths, strict=True))) for row in rows]
-    return "\n".join([*lines, NOTE, verdict(numbers)])
+    return "\n".join([*lines, *_laws(numbers, names), NOTE, verdict(numbers)])
 
 
 def write_cameras(
@@ -48,8 +48,8 @@ def write_cameras(
     require()
     rows = []
     for name, row in numbers.items():
-        rows.append([LABELS[name], _shown(row, "a"), _shown(row, "b"), number(row["ratio"]),
-                     _signed(row["apart"]), number(row["r"], 2)])
+        rows.append([_named(name, row, LABELS[name]), _shown(row, "a"), _shown(row, "b"),
+                     number(row["ratio"]), _signed(row["apart"]), number(row["r"], 2)])
         if name.startswith("theta"):
             rows.append(["in % of contrast", _percent(row, "a"), _percent(row, "b"), "", "", ""])
     head = ["", *(page.text(name) for name in names), "ratio", "apart", "r"]
@@ -59,7 +59,7 @@ def write_cameras(
              if numbers[name]["a"] is not None or numbers[name]["b"] is not None]
     panels = [
         Panel("verdict", "Side by side", paragraph(verdict(numbers, LABELS)) + table(head, rows)
-              + paragraph(NOTE, "note")),
+              + "".join(paragraph(line, "note") for line in [*_laws(numbers, names), NOTE])),
         Panel("pixels", "Their pixels", grid(drawn, 22) + paragraph(
             "All pixels of the maps; those without events of their own show the camera's value. "
             "Vertical lines: the values of the table above.", "note")),
@@ -68,6 +68,21 @@ def write_cameras(
             numeric=False))]
     page.write_page(path, f"{names[0]} and {names[1]}", "two cameras", panels, numbers,
                     overwrite=overwrite)
+
+
+def _named(name: str, row: dict[str, Any], label: str) -> str:
+    """A row's label; of the cutoff with the light for which it holds."""
+    return f"{label} {said_of_cutoff(row)}" if name == "cutoff_hz" else label
+
+
+def _laws(numbers: dict[str, Any], names: tuple[str, str]) -> list[str]:
+    """A sentence where the cutoffs of the two depend on light in different ways."""
+    row = numbers.get("cutoff_hz", {})
+    if row.get("at_dn") != GREY:
+        return []
+    first, second = names if row["a_by_light"] else names[::-1]
+    return [f"The cutoff of {first} is proportional to light, that of {second} is the same in any: "
+            f"compared at {GREY:g} DN."]
 
 
 def _shown(row: dict[str, Any], side: str) -> str:
