@@ -57,6 +57,15 @@ def test_v2e_is_told_that_its_logarithm_is_another(to: str) -> None:
     assert ("logarithm is linear below 20 DN" in told[1]) == (to == "v2e")
 
 
+@pytest.mark.parametrize("to", list(TARGETS))
+def test_what_dead_time_and_shot_noise_lose_is_told(to: str) -> None:
+    sensors = SensorModel(refractory_s=1e-3), SensorModel(shot_hz=1.5)
+    told = [export_camera(Camera.constant((4, 6)), to, sensor=sensor)[0].text for sensor in sensors]
+    assert ("within the dead time is lost" in told[0]) == (to != "v2e")
+    assert "1.500 Hz in the dark" not in told[0]
+    assert ("1.500 Hz in the dark" in told[1] and "light is\n  lost" in told[1]) == (to != "v2e")
+
+
 @pytest.mark.parametrize("to", ["v2e", "esim", "openeb", "iebcs"])
 def test_export_has_maps_scripts_and_words(
     tmp_path: Path, camera: Path, capsys: pytest.CaptureFixture[str], to: str

@@ -26,6 +26,10 @@ SRGB = '''The script undoes the sRGB of the video, as evflow simulate does; with
 as the last word it takes the video's bytes as light.
 '''
 
+DEAD = '''- Contrast that changes within the dead time is lost; the pixels of v2e and
+  evflow keep it for later. At 1 ms that took a sixth to a fifth of one video's events.
+'''
+
 # of an image read from the first argument
 SIZE = '''    if image.shape[:2] != ({height}, {width}):
         sys.exit(f"{{sys.argv[1]}} has {{image.shape[1]}}x{{image.shape[0]}} pixels, the camera "
@@ -59,12 +63,12 @@ def add_noise(x, y, t_us, p, maps, start, stop, seed=0):
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """The scalars that summarise a camera's maps: medians over the pixels, thresholds in
-    natural-log units, rates in Hz per pixel and polarity; sigma: standard deviation of a threshold
-    over pixels. Of the circuit, 0 where not measured: cutoff_hz (at 255 DN, if it depends on
-    light), dead_s, leak_hz and shot_hz (v2e's, in the dark), both part of eta. even_hz: the
-    measured cutoff if it does not depend on light; cutoff_hz is then chosen to be right at 128
-    DN."""
+    """The scalars that summarise a camera's maps: medians over the pixels, or an estimate's
+    summary, whose rates are means; thresholds in natural-log units, rates in Hz per pixel and
+    polarity; sigma: standard deviation of a threshold over pixels. Of the circuit, 0 where not
+    measured: cutoff_hz (at 255 DN, if it depends on light), dead_s, leak_hz and shot_hz (v2e's, in
+    the dark), both part of eta. even_hz: the measured cutoff if it does not depend on light;
+    cutoff_hz is then chosen to be right at 128 DN."""
 
     width: int
     height: int
@@ -120,6 +124,16 @@ class Settings:
         dead = f"dead time {1e3 * self.dead_s:.2f} ms" if self.dead_s else "no dead time"
         leak = f", leak {self.leak_hz:.3f} Hz (part of the ON noise)" if self.leak_hz else ""
         return f"{cutoff}, {dead}{leak}"
+
+    @property
+    def light_lost(self) -> str:
+        """An entry on measured shot noise for a program whose noise is the same in any light; ""
+        if none was measured."""
+        if not self.shot_hz:
+            return ""
+        return (f"- Shot noise was measured: {self.shot_hz:.3f} Hz in the dark (ON and OFF "
+                "together), a quarter\n  of it in the brightest pixels. Here noise has one rate in "
+                "any light: its dependence on light is\n  lost.\n")
 
     @property
     def refers_to(self) -> str:

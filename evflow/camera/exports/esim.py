@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from evflow.camera.exports.common import LIGHT, NOISE, Export, Maps, Settings
+from evflow.camera.exports.common import DEAD, LIGHT, NOISE, Export, Maps, Settings
 
 SCRIPT = '''"""Images through esim_py with the nearest scalars, and the measured noise added.
 
@@ -83,10 +83,9 @@ What ESIM cannot represent
   {sigma_on:.4f} and OFF {sigma_off:.4f}, is lost. (rpg_esim's contrast_threshold_sigma is no
   substitute: it draws anew for every pixel and frame.)
 - Noise: it has none. add_noise.py adds the measured rates, ON {eta_on:.4f} and OFF {eta_off:.4f} Hz
-  at the median pixel, to its output; noise events do not reset the pixels' memories.
-- The photoreceptor's low-pass (measured: {circuit}): it has none. ESIM discards contrast changes
-  within the dead time; the pixels of v2e and evflow keep them for later.
-{log}'''
+  per pixel, to its output; noise events do not reset the pixels' memories.
+{light_lost}- The photoreceptor's low-pass (measured: {circuit}): it has none.
+{dead}{log}'''
 
 
 LOG = '''- The log map: ESIM uses log(I / 255 + eps), {refers_to}.
@@ -96,7 +95,8 @@ LOG = '''- The log map: ESIM uses log(I / 255 + eps), {refers_to}.
 
 def export(maps: Maps, s: Settings) -> Export:
     """The medians, and a script that adds the noise."""
-    values = vars(s) | {"circuit": s.circuit, "dead_ns": round(s.dead_s * 1e9),
+    values = vars(s) | {"circuit": s.circuit, "dead": DEAD, "light_lost": s.light_lost,
+                        "dead_ns": round(s.dead_s * 1e9),
                         "same_size": s.same_size,
                         "log": "" if s.log_eps else LOG.format(refers_to=s.refers_to)}
     return Export(TEXT.format(**values),

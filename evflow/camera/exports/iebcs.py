@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from evflow.camera.exports.common import LIGHT, SRGB, SWITCH, Export, Maps, Settings
+from evflow.camera.exports.common import DEAD, LIGHT, SRGB, SWITCH, Export, Maps, Settings
 
 USUAL_DEAD_US = 100  # in IEBCS's examples
 FREQUENCIES = np.concatenate([np.arange(1, 10) * 10.0**k for k in range(-3, 5)])
@@ -72,6 +72,7 @@ What IEBCS cannot represent
   rate of each pixel, but IEBCS assigns them to its pixels at random: the distribution of rates is
   kept, the locations are not. Rates are quantised to its bins, 1 to 9 times a power of ten; a
   silent pixel fires once in 1000 s. A noise event stores the present intensity.
+{light_lost}{dead}\
 - Latency, time constant and jitter (lat, tau, jit) are those of IEBCS's examples, and so is the
   dead time (ref, microseconds) if none was measured (here: {circuit}). Its latency is no low-pass.
 - The log map is log(I + 1) with white at 1e4; {refers_to}.
@@ -84,7 +85,8 @@ def export(maps: Maps, s: Settings) -> Export:
     rates = {"bgnp": max(s.eta_on, slowest), "bgnn": max(s.eta_off, slowest)}
     values = vars(s) | rates | {
         "light": LIGHT + SWITCH, "srgb": SRGB, "same_size": s.same_size, "sigma": s.sigma,
-        "refers_to": s.refers_to, "circuit": s.circuit,
+        "refers_to": s.refers_to, "circuit": s.circuit, "dead": DEAD,
+        "light_lost": s.light_lost,
         "dead_us": round(s.dead_s * 1e6) or USUAL_DEAD_US}
     arrays = {"noise_pos.npy": spectrum(maps["eta_on"]), "noise_neg.npy": spectrum(maps["eta_off"])}
     return Export(TEXT.format(**values), {"run_iebcs.py": SCRIPT.format(**values)}, arrays)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from evflow.camera.exports.common import LIGHT, NOISE, SRGB, SWITCH, Export, Maps, Settings
+from evflow.camera.exports.common import DEAD, LIGHT, NOISE, SRGB, SWITCH, Export, Maps, Settings
 
 LOW, HIGH = 0.01, 1.0  # where OpenEB clips thresholds
 
@@ -62,8 +62,8 @@ What OpenEB cannot represent
   quarter was left at 1000 frames per second, a hundredth at 40; a static scene gets none. So both
   turn it off, and add_noise.py adds the measured maps, ON {eta_on:.4f} and OFF {eta_off:.4f} Hz per
   pixel; noise events do not reset the pixels' memories.
-- Its low-pass has two poles; one pole was measured ({circuit}).
-- The log map is log(I / 255 + 1e-7); {refers_to}:
+{light_lost}- Its low-pass has two poles; one pole was measured ({circuit}).
+{dead}- The log map is log(I / 255 + 1e-7); {refers_to}:
   dark scenes give other counts.
 '''
 
@@ -74,7 +74,8 @@ def export(maps: Maps, s: Settings) -> Export:
     outside = sum(int(((theta < LOW) | (theta > HIGH)).sum()) for theta in thetas)
     clipped = f"; {outside:,} of the measured ones are" if outside else ""
     values = vars(s) | {
-        "circuit": s.circuit, "dead_us": round(s.dead_s * 1e6), "sigma": s.sigma,
+        "circuit": s.circuit, "dead": DEAD,
+        "light_lost": s.light_lost, "dead_us": round(s.dead_s * 1e6), "sigma": s.sigma,
         "clipped": clipped, "light": LIGHT + SWITCH, "srgb": SRGB,
         "same_size": s.same_size, "refers_to": s.refers_to}
     return Export(TEXT.format(**values),
