@@ -128,6 +128,17 @@ def test_v2e_makes_the_measured_noise_of_its_scalars(on: float, off: float) -> N
     np.testing.assert_allclose(seen, (on, off), rtol=0.03)
 
 
+@pytest.mark.parametrize(("circuit", "words"), [
+    ({}, ["at 128 DN, that of maps.npz."]),
+    ({"leak_hz": 0.8}, ["its sum is right at 128 DN, 0.2700 Hz of each", "was ON 0.3400 and",
+                        "at 128 DN, that of maps.npz, ON without 0.5600"]),
+    ({"shot_hz": 1.5}, ["it is as measured, 0.4473 Hz of each", "0.813 times that of maps.npz."])])
+def test_v2e_is_told_which_noise_is_right(circuit: dict[str, float], words: list[str]) -> None:
+    camera = Camera.constant((4, 6), eta_on=0.9, eta_off=0.2)
+    text = " ".join(export_camera(camera, "v2e", sensor=SensorModel(**circuit))[0].text.split())
+    assert [word for word in [*words, "at most one noise event"] if word not in text] == []
+
+
 def test_openeb_is_given_no_rate_of_noise_that_it_does_not_make(camera: Path) -> None:
     export = export_camera(Camera.load(camera), "openeb")[0]
     words = export.text.split()

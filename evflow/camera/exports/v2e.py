@@ -63,9 +63,11 @@ What v2e cannot represent
   measured ON {sigma_on:.4f}, OFF {sigma_off:.4f}), normal and uncorrelated. Which pixel has which
   is lost.
 - --shot_noise_rate_hz is the total of ON and OFF in the dark, half of each, and falls to a quarter
-  in the brightest pixels. Here it is right at 128 DN for {excess}.
-- Noise is one rate on the command line, times nominal over actual threshold; in the script it is
-  the measured map, exact at 128 DN.
+  in the brightest pixels. Here {right}.
+- Noise is one rate on the command line, times nominal over actual threshold. In the script every
+  pixel has its own rate: at 128 DN, {share} of maps.npz{apart}.
+  v2e sends at most one noise event per pixel, polarity and frame: a hot pixel with
+  more needs more frames per second.
 - A noise event stores the present intensity in the pixel's memory.
 - Its circuit is the measured one ({circuit}), if the frames come at several times the cutoff: its
   low-pass is exact for short steps only, and its dead time delays events by whole frames.
@@ -93,14 +95,23 @@ def export(maps: Maps, s: Settings) -> Export:
         f"--pos_thres {s.theta_on:.4f} --neg_thres {s.theta_off:.4f} --sigma_thres {s.sigma:.4f} "
         f"--cutoff_hz {s.cutoff_hz:.1f} --leak_rate_hz {leak:.4f} --shot_noise_rate_hz {shot:.4f} "
         f"--refractory_period {s.dead_s:.6f} --dvs_h5 events.h5")
-    excess = (
-        "the noise\n  that is not leak, as measured" if separate else
-        "the OFF noise (measured {eta_off:.4f} Hz); what\n  ON has more of it ({eta_on:.4f} Hz) is "
-        "leak, a regular drift. --leak_rate_hz is higher than\n  that difference, as every shot "
-        "noise event takes the drift back" if leak else
-        "the mean of both (measured\n  ON {eta_on:.4f}, OFF {eta_off:.4f} Hz)").format(**vars(s))
+    measured, half = f"ON {on:.4f} and OFF {s.eta_off:.4f} Hz", shot * GREY / 2
+    if s.shot_hz:
+        right = (f"it is as measured, {half:.4f} Hz of each at 128 DN;\n  in the recording's own "
+                 f"light, noise without leak was {measured}")
+    elif separate:
+        right = (f"its sum is right at 128 DN, {half:.4f} Hz of each;\n  measured noise without "
+                 f"leak was {measured}")
+    elif leak:
+        right = (f"it is right at 128 DN for the OFF noise (measured {s.eta_off:.4f}\n  Hz); what "
+                 f"ON has more of it ({s.eta_on:.4f} Hz) is leak, a regular drift. --leak_rate_hz\n"
+                 "  is higher than that difference, as every shot noise event takes the drift back")
+    else:
+        right = f"it is right at 128 DN for the mean of both (measured\n  {measured})"
     values = vars(s) | {
-        "circuit": s.circuit, "sigma": s.sigma, "command": command, "excess": excess,
+        "circuit": s.circuit, "sigma": s.sigma, "command": command, "right": right,
+        "share": f"{gain * GREY:.3f} times that" if s.shot_hz else "that",
+        "apart": f", ON without {s.leak_seen:.4f} Hz of leak" if s.leak_hz else "",
         "srgb": SRGB, "log": LOG if s.log_eps else ""}
     source = SCRIPT.format(**vars(s) | {
         "gain": gain, "leak_seen": s.leak_seen, "light": LIGHT + SWITCH,
