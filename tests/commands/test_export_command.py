@@ -273,6 +273,14 @@ def test_images_for_esim_are_made_linear(
         np.testing.assert_array_equal(found, np.rint(want))
 
 
+def test_esim_torch_is_given_the_folder_that_it_reads() -> None:
+    """generate_events.py takes folders of exactly imgs/ and timestamps.txt."""
+    text = export_camera(Camera.constant((4, 4)), "esim")[0].text
+    for line in ("linear_images.py IMAGES FOLDER/imgs\n", "FOLDER/timestamps.txt\n", "-i FOLDER "):
+        assert line in text
+    assert "t in nanoseconds" in text
+
+
 def test_noise_that_is_added_has_the_measured_rates() -> None:
     home: dict[str, Any] = {}
     exec(NOISE, home)

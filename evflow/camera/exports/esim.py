@@ -68,9 +68,13 @@ Videos and most images are in sRGB, which ESIM takes as light: first undo it.
     python linear_images.py IMAGES LINEAR_IMAGES
 esim_py, noise added:
     python run_esim.py LINEAR_IMAGES TIMESTAMPS.txt EVENTS.npz
-esim_torch, without noise:
-    python esim_torch/scripts/generate_events.py -i FRAMES -o OUT \\
+esim_torch, without noise: it reads a folder that holds imgs/ and timestamps.txt (seconds, a line
+for each image) and nothing else, and passes over all others without a word.
+    python linear_images.py IMAGES FOLDER/imgs
+    cp TIMESTAMPS.txt FOLDER/timestamps.txt
+    python esim_torch/scripts/generate_events.py -i FOLDER -o OUT \\
         -cp {theta_on:.4f} -cn {theta_off:.4f} -rp {dead_ns}
+It writes a .npz for each image, with t in nanoseconds (later versions: events.h5, microseconds).
 
 ESIM reads a folder in the order of the letters of its names, 10.png before 2.png, and meets the
 times in that order. linear_images.py numbers the images so that both orders are one.
