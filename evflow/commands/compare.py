@@ -46,16 +46,22 @@ class Compare(Reading):
     json: bool = False
     """Print all numbers as JSON."""
 
-    def _streams(self) -> tuple[Events, Events]:
-        """Both streams. A time range refers to REAL; if SYNTHETIC shares its clock the same times
-        are used, otherwise the same number of seconds from its own first event."""
+    def _streams(self) -> tuple[Events, Events, tuple[int, int] | None]:
+        """Both streams, and the time to compare where that is not what both cover. A time range
+        refers to REAL; if SYNTHETIC shares its clock the same times are used, though it may be
+        silent in them, otherwise the same number of seconds from its own first event."""
         real = print_notes(self.read(self.real, with_frames=False)).events
         if (self.start is None and self.stop is None) or not len(real):
-            return real, print_notes(self.read(self.synthetic, with_frames=False)).events
+            return real, print_notes(self.read(self.synthetic, with_frames=False)).events, None
         whole = dataclasses.replace(self, start=None, stop=None)
-        same = print_notes(whole.read(self.synthetic, with_frames=False)).events.slice(
-            int(real.t[0]), int(real.t[-1]) + 1)
-        return real, same if len(same) else self.read(self.synthetic, with_frames=False).events
+        synthetic = print_notes(whole.read(self.synthetic, with_frames=False)).events
+        span = int(real.t[0]), int(real.t[-1]) + 1
+        if len(same := synthetic.slice(*span)):
+            return real, same, None
+        every = whole.read(self.real, with_frames=False).events
+        if len(synthetic) and every.t[0] <= synthetic.t[-1] and synthetic.t[0] <= every.t[-1]:
+            return real, synthetic, span
+        return real, self.read(self.synthetic, with_frames=False).events, None
 
     def _cameras(self, *both: tuple[Camera, Camera | None]) -> None:
         """Compare two cameras."""
@@ -113,8 +119,8 @@ class Compare(Reading):
             return
         self._check_targets()
         note_idle(self, "only the events of the streams are compared")
-        real, synthetic = self._streams()
-        numbers = compare(real, synthetic)
+        real, synthetic, span = self._streams()
+        numbers = compare(real, synthetic, span_us=span)
         words = describe_streams(numbers)
         facts = {"real": str(self.real), "synthetic": str(self.synthetic),
                  "grade": worst(judge_streams(numbers)), "verdict": words.splitlines(), **numbers}

@@ -42,7 +42,8 @@ def _enough(numbers: dict[str, Any]) -> list[Judged]:
     if fewest >= FEWEST and not short:
         return []
     seen = (f"Only {share:.1%} of the shorter stream's time is compared" if short else
-            f"One of them has only {fewest} event{'s' * (fewest != 1)} in this time")
+            f"One of them has {f'only {fewest}' if fewest else 'no'} event{'s' * (fewest != 1)} "
+            "in this time")
     return [Judged("fair", "", 1.0, f"{seen}: too little to call them alike.", advice=
                    "Compare more of both: is one cut short, or on another clock?")]
 

@@ -277,6 +277,23 @@ def test_a_span_is_the_same_of_both_streams(
         assert facts["duration_s"] == pytest.approx(0.25e-6 * length, rel=0.02)
 
 
+def test_a_stream_that_is_silent_in_a_span_is_not_compared_with_another_time(
+    streams: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = read_recording(streams[0]).events
+    first, length = int(whole.t[0]), whole.duration_us
+    quiet = tmp_path / "quiet.npz"  # only its last quarter
+    write_events(quiet, Recording.of_events(whole.slice(first + 3 * length // 4, first + length)),
+                 format="npz")
+    assert main(["compare", str(streams[0]), str(quiet), "-o", str(tmp_path / "out"),
+                 "--stop", f"{0.5e-6 * length}"]) == 0
+    said = capsys.readouterr().out
+    assert "No synthetic ON events" in said
+    assert "share no time" not in said
+    facts = json.loads((tmp_path / "out" / "compare.json").read_text())
+    assert (facts["events"]["synthetic"], facts["aligned_at"]) == (0, "clock")
+
+
 def test_compare_refuses_other_sizes(
     streams: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
