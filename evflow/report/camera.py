@@ -247,7 +247,7 @@ def _stretch(recording: Recording, trial: Trial) -> str:
     zero = int(recording.events.t[0])
     t0, t1 = (int(recording.frame_times[i]) for i in trial.frames)
     words = (f"The recording's frames {trial.frames[0]} to {trial.frames[1]} "
-             f"({(t0 - zero) / 1e6:.3f} to {(t1 - zero) / 1e6:.3f} s after its first event), "
+             f"({(t0 - zero) / 1e6:z.3f} to {(t1 - zero) / 1e6:z.3f} s after its first event), "
              "interpolated by optical flow to half a pixel of motion, seen by the estimated "
              "camera. ")
     if trial.span_us[0] > t0:

@@ -122,6 +122,7 @@ def histograms(
             axis.hist(np.clip(values, bins[0], bins[-1]), bins=bins, color=colour, alpha=0.45,
                       weights=np.full(values.size, 100.0 / values.size), label=label)
             axis.axvline(row[side], color=colour, lw=1.2)
+        axis.locator_params(axis="x", nbins=5)  # more labels run together
         axis.set(xlabel="natural log units" if name.startswith("theta") else "Hz per pixel",
                  ylabel="pixels [%]")
         axis.legend()

@@ -41,6 +41,9 @@ def test_what_was_not_measured_is_not_drawn(drawn: list[Any]) -> None:
     pages.histograms((a, b), "theta_on", ("one", "two"), numbers["theta_on"])
     pages.histograms((a, b), "eta_on", ("one", "two"), numbers["eta_on"])
     theta, eta = drawn
+    for axis in drawn:  # more labels run together
+        low, high = axis.get_xlim()
+        assert sum(low <= at <= high for at in axis.get_xticks()) <= 6
     assert [t.get_text() for t in theta.get_legend().get_texts()] == ["one", "two: not measured"]
     assert len(theta.containers) == 1
     assert [line.get_xdata()[0] for line in eta.lines] == [pytest.approx(0.1), pytest.approx(0.48)]

@@ -9,6 +9,7 @@ import json
 import re
 import shutil
 import subprocess
+import types
 import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
@@ -324,6 +325,14 @@ def test_the_poorer_polarity_is_named(measured: tuple[CameraEstimate, Recording]
     assert next(iter(judge_estimate(lost, None, None))).short == "undetermined"
     half = dataclasses.replace(found, undetermined=("theta_off",))
     assert [known(half, key) for key in ("on", "off")] == [True, False]
+
+
+def test_a_frame_just_before_the_first_event_is_at_zero() -> None:
+    """Not at -0.000 s."""
+    recording: Any = types.SimpleNamespace(
+        events=types.SimpleNamespace(t=np.array([1400])), frame_times=np.array([1000, 976_000]))
+    trial: Any = types.SimpleNamespace(frames=(0, 1), span_us=(1000, 976_000), notes=())
+    assert "(0.000 to 0.975 s after" in camera._stretch(recording, trial)
 
 
 def test_the_busiest_stretch_is_bounded_and_without_gaps() -> None:

@@ -14,6 +14,7 @@ import evflow
 from evflow import Events, EvflowDataError, Recording, read_recording, write_events
 from evflow.cli import main
 from evflow.metrics.streams import distances
+from evflow.report import figures
 from evflow.report.alike import describe_streams, judge_streams
 from evflow.report.page import WIDEST, blocks, write_page
 from evflow.report.verdict import Judged, advice, sentences, worst
@@ -164,6 +165,24 @@ def test_noise_comes_alone_and_signal_in_company() -> None:
     assert numbers["same_polarity"]["real"] == 0.0
     assert numbers["same_polarity"]["synthetic"] == pytest.approx(0.5, abs=0.05)
     assert "noise rates" in describe_streams(numbers)
+
+
+def test_labels_of_times_are_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also one at the right edge."""
+    kept: list[Any] = []
+
+    def keep(figure: Any, *_: Any) -> bytes:
+        kept.append(figure)
+        return b""
+
+    monkeypatch.setattr(figures, "printed", keep)
+    edges = np.linspace(-6.0, 2.0, 65)
+    shares = np.where(edges[1:] <= -1.0, 1 / 40, 0.0)  # up to .1 s
+    figures.times({"histogram": {"log10_s_edges": edges, "real": shares, "synthetic": shares}},
+                  ("one", "two"), "delay")
+    labels = kept[0].axes[0].get_xticklabels()
+    assert labels[-1].get_text() == "0.1 s"
+    assert max(label.get_window_extent().x1 for label in labels) < kept[0].bbox.x1
 
 
 def test_neighbour_delays_agree_with_a_loop() -> None:
