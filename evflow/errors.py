@@ -50,6 +50,7 @@ CODES: dict[str, str] = {
     "EV036": "the light flickers",
     "EV037": "frames and events displaced",
     "EV038": "repeated events",
+    "EV039": "the event rate is capped",
 }
 
 

@@ -2,7 +2,8 @@
 
 A window runs from one frame to the first that is at least `min_us` later; the next begins where it
 ends. Only windows covered by the events are used, and none across a gap in them or a dropped or
-faulty frame: there the path of brightness is unknown for too long, or wrong.
+faulty frame: there the path of brightness is unknown for too long, or wrong; and none in which the
+event rate stands at a ceiling, where events are missing.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from evflow.checks import need
 from evflow.errors import EvflowDataError
 from evflow.io.decode.units import too_large
 from evflow.notes import Note, why_no_frames
+from evflow.recordings.ceiling import rate_ceiling
 from evflow.recordings.gaps import event_gaps
 from evflow.recordings.glitches import faulty_frames
 from evflow.types import Recording, Window
@@ -29,6 +31,7 @@ EDGE_EVENTS = 10  # or this many of the local intervals between events
 BEYOND = 0.1  # share of the recording's time with events before the first or after the last frame
 NUMBER = re.compile(r"[0-9]+(\.[0-9]+)?")
 MOST_WINDOWS = 10_000_000  # four days of 33 ms; a clock that jumps to Unix time makes 5e10
+CAPPED = 0.05  # share of a window's time at a ceiling of the event rate
 DROPPED = 3.0  # a frame interval of more than this many medians means missing frames
 
 
@@ -96,12 +99,14 @@ def plan_windows(recording: Recording, min_us: int = MIN_US) -> WindowPlan:
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Obstacles:
     """What no window may cross. times: of the frames; late: (N,) intervals with missing frames;
-    silent: (M, 2) us, begin and end of gaps in the events; glitches, steps: from
-    `faulty_frames`."""
+    silent: (M, 2) us, begin and end of gaps in the events; capped: (M, 2) us, of times at a ceiling
+    of `capped_per_s` events; glitches, steps: from `faulty_frames`."""
 
     times: np.ndarray
     late: np.ndarray
     silent: np.ndarray
+    capped: np.ndarray
+    capped_per_s: float
     glitches: dict[int, str]
     steps: dict[int, str]
 
@@ -117,6 +122,10 @@ class _Obstacles:
         if len(silent):
             return (f"no events for {np.ptp(silent[0]) / 1e3:.1f} ms (lost packets, or a static "
                     "scene?)"), last
+        edges = np.clip(self.capped, self.times[first], self.times[last])
+        if np.diff(edges).sum() > CAPPED * (self.times[last] - self.times[first]):
+            return (f"the event rate stands at a ceiling of {self.capped_per_s:,.0f} events/s "
+                    "(readout or rate control?), where events are lost"), last
         faults = [(i, why) for i, why in self.glitches.items() if first <= i <= last] + [
             (i, why) for i, why in self.steps.items() if first <= i < last]
         if faults:
@@ -137,9 +146,10 @@ def _obstacles(recording: Recording, start: int, stop: int) -> _Obstacles:
 def _look(recording: Recording, start: int, stop: int) -> _Obstacles:
     times, t = recording.frame_times, recording.events.t
     late = np.flatnonzero(np.diff(times) > DROPPED * np.median(np.diff(times)))
-    gaps = event_gaps(t)
-    return _Obstacles(times, late, np.stack([t[gaps], t[gaps + 1]], -1),
-                      *faulty_frames(recording, start, stop))
+    gaps, ceiling = event_gaps(t), rate_ceiling(t)
+    capped = ceiling.spans if ceiling else np.zeros((0, 2), np.int64)
+    return _Obstacles(times, late, np.stack([t[gaps], t[gaps + 1]], -1), capped,
+                      ceiling.per_s if ceiling else 0.0, *faulty_frames(recording, start, stop))
 
 
 def iter_windows(

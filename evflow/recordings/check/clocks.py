@@ -7,6 +7,7 @@ import numpy as np
 
 from evflow.io.decode.misread import misread
 from evflow.recordings.bunches import bunch
+from evflow.recordings.ceiling import rate_ceiling
 from evflow.recordings.check.findings import Finding, Severity
 from evflow.recordings.flicker import flicker
 from evflow.recordings.gaps import event_gaps
@@ -66,6 +67,18 @@ def _dropped(recording: Recording) -> list[Finding]:
         "EV030", "warning", f"about {lost} frames are missing in {places}, first after frame "
         f"{at[0]} ({between[at[0]] / 1e3:.1f} ms instead of the usual {usual / 1e3:.1f} ms).",
         "No window crosses them; lower the camera's frame rate or its load.")]
+
+
+def capped(recording: Recording) -> list[Finding]:
+    """EV039 if the event rate has a ceiling."""
+    found = rate_ceiling(recording.events.t)
+    return [] if found is None else [Finding(
+        "EV039", "warning", f"for {found.share:.0%} of the time with events, their rate is "
+        f"{found.per_s:,.0f} events/s and never much higher: a readout at its limit, or an event "
+        "rate control (ERC)?",
+        "Events are lost or late there; thresholds would come out too high. An estimate leaves out "
+        "the windows at the limit. Record slower motion or less contrast, a part of the sensor "
+        "(ROI), or with the rate control off.")]
 
 
 def bunches(recording: Recording) -> list[Finding]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from pathlib import Path
 from typing import Unpack
@@ -11,7 +12,7 @@ from evflow.checks import need
 from evflow.errors import EvflowDataError
 from evflow.io.hints import HintArguments
 from evflow.recordings.check.agreement import agreement
-from evflow.recordings.check.clocks import bunches, clocks, flickers
+from evflow.recordings.check.clocks import bunches, capped, clocks, flickers
 from evflow.recordings.check.contents import contents, repeated
 from evflow.recordings.check.findings import Finding, Report
 from evflow.recordings.check.images import images
@@ -33,8 +34,8 @@ def check(
     EV025 gaps, EV026 clock jumps, EV027 saturated or black frames, EV028 repeated frames, EV029
     mirrored or transposed frames, EV030 dropped frames, EV031 bit depth, EV032 colour, EV033 hot
     pixels, EV034 unrelated or frozen frames, EV035 events that bunch at the frames, EV036
-    flickering light, EV037 displaced frames, EV038 repeated events; and for a path, whatever the
-    reader refuses.
+    flickering light, EV037 displaced frames, EV038 repeated events, EV039 capped event rate; and
+    for a path, whatever the reader refuses.
 
     Args:
         recording_or_path: the recording, or a file or folder in any known format.
@@ -66,7 +67,8 @@ def _findings(recording: Recording) -> list[Finding]:
         return found
     found += clocks(recording)
     timed = all(f.code != "EV023" for f in found)
-    found += [*flickers(recording), *repeated(recording.events)] if timed else []
+    if timed:
+        found += [*flickers(recording), *capped(recording), *repeated(recording.events)]
     found += images(recording)
     if recording.has_frames and timed:
         try:
@@ -80,6 +82,16 @@ def _findings(recording: Recording) -> list[Finding]:
             except EvflowDataError as error:
                 found.append(Finding.of(error))
             release(recording)
-            found += agreement(recording)
+            found += _late(agreement(recording), found)
     release(recording)
     return sorted(found, key=lambda f: ("error", "warning", "note").index(f.severity))
+
+
+def _late(agreed: list[Finding], found: list[Finding]) -> list[Finding]:
+    """What was found on clocks, with other advice where events wait for the readout."""
+    if all(f.code != "EV039" for f in found):
+        return agreed
+    return [dataclasses.replace(
+        f, severity="warning", fix="Events that wait at a ceiling of their rate come late "
+        "(EV039): check a part of the recording without.") if f.code == "EV024" else f
+        for f in agreed]
