@@ -16,6 +16,7 @@ import numpy as np
 from evflow.io.decode.misread import too_few
 from evflow.recordings.check.drift import backwards, drifting
 from evflow.recordings.check.findings import Finding
+from evflow.recordings.check.rows import rolling
 from evflow.recordings.check.steps import (
     LEAST_CELLS,
     LEAST_EVENTS,
@@ -46,6 +47,13 @@ def agreement(recording: Recording) -> list[Finding]:
     steps = frame_steps(recording)
     if steps is None:
         return []
+    found = _judged(recording, steps)
+    late = rolling(steps) if all(f.code == "EV024" for f in found) else None
+    return [*found, late] if late else found
+
+
+def _judged(recording: Recording, steps: Steps) -> list[Finding]:
+    """What `agreement` finds, but for frames that are read row by row."""
     if wrong := _missing(steps) or _frozen(recording, steps):
         return wrong
     if np.isnan(here := steps.correlation()):

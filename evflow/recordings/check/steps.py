@@ -56,9 +56,9 @@ class Steps:
 
     def correlations(self, offsets_us: np.ndarray, flip: str = "") -> np.ndarray:
         """Pearson's r with the frames' clock shifted by each offset; NaN if there are too few."""
-        return self._r(self._sums(offsets_us, flip), flip)
+        return self.r_of(self.sums(offsets_us, flip), flip)
 
-    def _sums(self, offsets_us: np.ndarray, flip: str = "") -> np.ndarray:
+    def sums(self, offsets_us: np.ndarray, flip: str = "") -> np.ndarray:
         """What r is computed from (K, 6, offsets): sums over cells of the change a, the net events
         b, a², b² and ab, and the number of events."""
         sums = np.zeros((len(self.bounds), 6, len(offsets_us)))
@@ -66,7 +66,7 @@ class Steps:
             known = np.isfinite(change)
             forget(self.events.x, self.events.y, self.events.t, self.events.p)
             near = self.events.slice(int(t0 + offsets_us.min()), int(t1 + offsets_us.max()))
-            code = _codes(near, self.cell)
+            code = codes(near, self.cell)
             edges = np.searchsorted(near.t, np.stack([t0 + offsets_us, t1 + offsets_us]))
             a = change[known]
             sum_a, sum_aa = a.sum(), (a * a).sum()  # no BLAS: its threads cost more than they give
@@ -77,8 +77,8 @@ class Steps:
                     sum_a, b.sum(), sum_aa, (b * b).sum(), (a * b).sum(), last - first)
         return sums
 
-    def _r(self, sums: np.ndarray, flip: str = "", kept: slice = WHOLE) -> np.ndarray:
-        """r of the kept steps, given the sums of all."""
+    def r_of(self, sums: np.ndarray, flip: str = "", kept: slice = WHOLE) -> np.ndarray:
+        """r of the kept steps, given the sums of all, as of `sums`."""
         a, b, aa, bb, ab, count = sums[kept].sum(0)
         cells = max(int(np.isfinite(self.changes[flip][kept]).sum()), 1)
         power = (aa - a**2 / cells) * (bb - b**2 / cells)
@@ -116,11 +116,11 @@ class Steps:
 
     @functools.cached_property
     def _swept(self) -> np.ndarray:
-        return self._sums(self.offsets_us)
+        return self.sums(self.offsets_us)
 
     def sweep(self, kept: slice = WHOLE) -> np.ndarray:
         """r of the kept steps at each of `offsets_us`."""
-        return self._r(self._swept, kept=kept)
+        return self.r_of(self._swept, kept=kept)
 
     def most_events(self) -> int:
         """Events within the steps at the one of `offsets_us` where they are most."""
@@ -229,7 +229,7 @@ def displacement(steps: Steps) -> tuple[float, float, int, int]:
     shape = 2 * rows, columns + 1  # spectra of images beside zeros, so that nothing wraps round
     product, energy, power = np.zeros(shape, complex), np.zeros(shape, complex), 0.0
     for change, (t0, t1) in zip(steps.changes[""], steps.bounds, strict=True):
-        code = _codes(steps.events.slice(int(t0), int(t1)), steps.cell)
+        code = codes(steps.events.slice(int(t0), int(t1)), steps.cell)
         sign = np.bincount(code, minlength=2 * len(change)).reshape(-1, 2)
         net = (sign[:, 1] - sign[:, 0]).astype(np.float64)
         known = np.isfinite(change)
@@ -276,7 +276,7 @@ def _cells(image: np.ndarray, shape: tuple[int, int], cell: int) -> np.ndarray:
     return padded.reshape(rows, cell, -1, cell).sum((1, 3)).ravel()
 
 
-def _codes(events: Events, cell: int) -> np.ndarray:
+def codes(events: Events, cell: int) -> np.ndarray:
     """2 (number of the cell) + (1 if ON), of each event."""
     columns = -(-events.size[0] // cell)
     return 2 * ((events.y // cell).astype(np.int64) * columns + events.x // cell) + events.p
