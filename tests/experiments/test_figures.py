@@ -246,13 +246,18 @@ def other_cameras() -> dict[str, Figures]:
 
 
 def longer() -> dict[str, Figures]:
-    names = {"estimate": "evflow", "truth": "oracle", "LGAN": "lgan"}
-    gains = {label: [values("see_better_long", rf"SSIM\|{name} \(3\)", "to default", k)[0]
-                     for k in range(2)] for label, name in names.items()}
-    return {label: [*gains.get(label, [0.0]), *(
-        values("see_better_long", rf"{measure}\|{name} \(3\)", 2)[0]
-        for measure in ("LPIPS", "MSE"))]
-        for label, name in {"default parameters": "default", **names}.items()}
+    files = {"default parameters": ("default", ""), "estimate": ("evflow", ""),
+             "truth": ("oracle", ""), "LGAN": ("lgan", ""),
+             "thresholds uniform": ("wide", "_wide")}
+
+    def of(name: str, file: str) -> Figures:
+        at, row = f"see_better_long{file}", rf"{name} \(3\)"
+        gain = [0.0] if name == "default" else [
+            values(at, rf"SSIM\|{row}", "to default", k)[0] for k in range(2)]
+        return [*gain, *(values(at, rf"{measure}\|{row}", "mean")[0]
+                         for measure in ("LPIPS", "MSE"))]
+
+    return {label: of(*file) for label, file in files.items()}
 
 
 def circuit() -> dict[str, Figures]:
