@@ -267,6 +267,20 @@ def test_the_less_was_watched_the_more_it_takes() -> None:
     assert (much, less, least) == pytest.approx((0.0, FEWER, 2 * FEWER))
 
 
+def test_a_gain_by_a_path_that_explains_little_counts_less() -> None:
+    data, slow = looked_at(0.0, 60.0), np.array([0.0, 1 / (2 * np.pi * 60.0), 0.0])
+    clear = Regression(data)
+    off = np.random.default_rng(0).normal(0, 2.0, (2, *np.shape(data.on))).astype(np.float32)
+    poor = Regression(data._replace(on=data.on + off[0], off=data.off + off[1]))
+    left = [model.unexplained(slow) for model in (clear, poor)]
+    assert 1 - np.exp(left[0]) > 0.9 > 0.5 > 1 - np.exp(left[1])
+    worth = [receptor_search._worth(slow, model, 400.0) for model in (clear, poor)]
+    assert worth == pytest.approx([400.0, 400.0 * (1 - np.exp(left[1])) / receptor_search.CLEAR])
+    assert receptor_search._worth(slow, poor, 10.0) == 10.0
+    odds = [receptor_search._odds(slow, poor, 400.0, left[1] + gain) for gain in (0.0, 0.1)]
+    assert odds[1] - odds[0] == pytest.approx(0.05 * worth[1])
+
+
 def test_the_less_probable_law_widens_what_is_left_open() -> None:
     """As a mixture of two values: chance times the square of their distance."""
     other = Other(0.25, 5e-3, np.array([0.2, 0.6]))
