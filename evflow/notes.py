@@ -91,6 +91,7 @@ NOTES: dict[str, str] = {
     "pixels.dead": "pixels never fire",
     "pixels.fast": "the photoreceptor's cutoff is too high to be measured",
     "pixels.hot": "pixels fire without a signal",
+    "pixels.lost": "pixels lose contrast in their dead time",
     "pixels.log": "the pixels' response is logarithmic in dark light too",
     "pixels.slow": "the photoreceptor's low-pass was measured",
     "pixels.unsure": "most pixels have no events of their own",

@@ -24,17 +24,20 @@ ENOUGH = 200  # intervals just above
 SHARP = 8.0  # ratio of densities above and below; a slow pixel's only double over this distance
 PIXELS = 20  # with intervals at the edge: a hot pixel may fire as regularly as a clock
 LATTICE = 20  # distinct intervals within an octave: coarse times have an edge at each step
+SHORTEST = 0.01  # share of the intervals
 FEW_SHORTER = 0.05  # maximum share of shorter intervals: from noise that ignores the dead time
 
 
 @dataclasses.dataclass(frozen=True)
 class DeadTime:
     """seconds, std_s: the dead time, 0 and NaN if the recording does not show it; below_s: an upper
-    bound, from shortest intervals that may have another cause, NaN if there is none."""
+    bound, from shortest intervals that may have another cause, NaN if there is none; shortest_s:
+    what SHORTEST of the intervals are below, 0 with too few."""
 
     seconds: float = 0.0
     std_s: float = float("nan")
     below_s: float = float("nan")
+    shortest_s: float = 0.0
 
     @property
     def measured(self) -> bool:
@@ -46,6 +49,9 @@ def dead_time(events: Events) -> DeadTime:
     intervals, pixel = own_intervals(events)
     order = np.argsort(intervals, kind="stable")
     intervals, pixel = intervals[order], pixel[order]
+    if len(intervals) < ENOUGH:
+        return DeadTime()
+    unknown = DeadTime(shortest_s=1e-6 * float(np.quantile(intervals, SHORTEST)))
     edges = SHORTEST_US * STEP ** np.arange(int(np.log(LONGEST_US / SHORTEST_US) / np.log(STEP)))
 
     def between(low: float, high: float) -> np.ndarray:
@@ -56,16 +62,17 @@ def dead_time(events: Events) -> DeadTime:
     sharpness = many / (few * density + 1.0) * (many >= ENOUGH)
     best = int(np.argmax(sharpness))
     if sharpness[best] < SHARP:
-        return DeadTime()
+        return unknown
     at_edge = slice(*np.searchsorted(intervals, edges[best] * np.array([0.95, 1.1])))
     near = intervals[at_edge]
     octave = intervals[slice(*np.searchsorted(intervals, edges[best] * np.array([0.95, 1.9])))]
     shorter = np.searchsorted(intervals, 0.95 * edges[best]) / len(intervals)
     few_pixels = len(np.unique(pixel[at_edge])) < PIXELS
     if len(np.unique(octave)) < LATTICE or shorter > FEW_SHORTER or few_pixels:
-        return DeadTime()
+        return unknown
     low, middle = np.quantile(near, [0.05, 0.5])
-    return DeadTime(float(low) * 1e-6, float(max(middle - low, 0.02 * low)) * 1e-6)
+    seconds, std_s = float(low) * 1e-6, float(max(middle - low, 0.02 * low)) * 1e-6
+    return DeadTime(seconds, std_s, shortest_s=seconds)
 
 
 def own_intervals(events: Events) -> tuple[np.ndarray, np.ndarray]:

@@ -76,15 +76,15 @@ def part(span_us: tuple[int, int], evidence: PixelEvidence) -> Part:
     return Part(middle, theta / kept)
 
 
-def thirds(parts: Sequence[Part]) -> tuple[Third, ...]:
+def thirds(parts: Sequence[Part], excess: Array | float = 1.0) -> tuple[Third, ...]:
     """The thirds of the time between the first and the last stretch; empty if one of them has too
-    few stretches."""
+    few stretches. excess: (2,) by which the parts' thresholds are too high."""
     parts = sorted((p for p in parts if np.isfinite(p.theta).all() and (p.theta > 0).all()),
                    key=lambda p: p.middle_us)
     if len(parts) < 3 * LEAST_PARTS:
         return ()
     edges = np.linspace(parts[0].middle_us, parts[-1].middle_us + 1, 4)
-    log_theta = np.log([p.theta for p in parts])
+    log_theta = np.log([p.theta / excess for p in parts])
     which = np.searchsorted(edges[1:3], [p.middle_us for p in parts], side="right")
     count = np.bincount(which, minlength=3)
     if count.min() < LEAST_PARTS:

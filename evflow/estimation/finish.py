@@ -24,7 +24,7 @@ from evflow.estimation.one_polarity import (
 )
 from evflow.estimation.pooled import Quiet, need_shown, quiet_times
 from evflow.estimation.refine import Chunk
-from evflow.estimation.remarks import camera_notes, noise_notes, receptor_notes
+from evflow.estimation.remarks import camera_notes, lost_notes, noise_notes, receptor_notes
 from evflow.estimation.result import CameraEstimate
 from evflow.estimation.shot import Shot, at_mean_light, measured_noise, measured_shot, scatter
 from evflow.estimation.state import Advance, State, summary_so_far, windows_of
@@ -122,12 +122,16 @@ def estimate(
         again = _counted(windows_of(state.read), advance)
         camera, error = maps.by_flow(state.params, again, summary, std)
     camera, error, summary, std = maps.with_rates(camera, error, sent, hot, summary, std)
-    extent, thirds = extent or EVERYTHING, drift.thirds(state.parts)
+    if lost := front_end.lost:
+        camera, error, summary, std = maps.with_contrast_lost(camera, error, summary, std, lost)
+    extent = extent or EVERYTHING
+    thirds = drift.thirds(state.parts, lost.excess if lost else 1.0)
     return CameraEstimate(
         camera, error, summary, std, (state.n_shown >= VALID_EVENTS) & ~hot, n_events, hot, dead,
         state.windows,
         (*before, *camera_notes(stats, lacking, alone, n_events, summary, hot, dead),
-         *receptor_notes(front_end.found, refined.optics, summary, std), *noise_notes(shot), *after,
+         *receptor_notes(front_end.found, refined.optics, summary, std), *lost_notes(lost),
+         *noise_notes(shot), *after,
          *extent.notes(), *drift.notes(thirds)),
         tuple(f"theta_{name}" for name in lacking),
         **_measured(front_end, refined.optics, leak, shot), extent=extent, thirds=thirds)

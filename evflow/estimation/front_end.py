@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from evflow.estimation.dead_time import DeadTime, dead_time, first_events
-from evflow.estimation.refine import Found, Stretch, find_photoreceptor, frame_noise
+from evflow.estimation.refine import Found, Lost, Stretch, find_photoreceptor, frame_noise
 from evflow.estimation.refine.path import Films
 from evflow.estimation.refine.photoreceptor import STRETCHES
 from evflow.recordings.faulty_pixels import dead_pixels, hot_among_neighbours
@@ -22,7 +23,8 @@ from evflow.simulator.photoreceptor import IDEAL, Photoreceptor
 class FrontEnd:
     """seen_by: how the pixels see what the frames show; noise_dn, blur_s: the frames' noise in DN
     and their exposure, 0 if it is unknown; found: the search for the photoreceptor, None if there
-    was none; dead: the dead time; faulty: (H, W) bool, pixels that fire alone or never, None if
+    was none; dead: the dead time; lost: the contrast that pixels lose in it, None if they keep it;
+    faulty: (H, W) bool, pixels that fire alone or never, None if
     there are none; films: of stretches that are still to be read."""
 
     seen_by: Photoreceptor = IDEAL
@@ -30,6 +32,7 @@ class FrontEnd:
     blur_s: float = 0.0
     found: Found | None = None
     dead: DeadTime = dataclasses.field(default_factory=DeadTime)
+    lost: Lost | None = None
     faulty: np.ndarray | None = None
     films: Films = dataclasses.field(default_factory=dict)
 
@@ -44,10 +47,21 @@ def find_front_end(stretches: Sequence[Stretch], *, measured: bool) -> FrontEnd:
         return FrontEnd(dead=dead, faulty=faulty)
     noise_dn = frame_noise([(recording, i) for recording, run in runs for i in run])
     films: Films = {}
-    found = find_photoreceptor(runs, noise_dn, films) if measured else None
+    found, lost = (find_photoreceptor(runs, noise_dn, films, **searched_with(dead)) if measured
+                   else (None, None))
     blur_s = 1e-6 * float(np.mean([recording.exposure_us for recording, _ in runs]))
     seen_by = found.used if found else IDEAL
-    return FrontEnd(seen_by, noise_dn, blur_s, found, dead, faulty, films)
+    return FrontEnd(seen_by, noise_dn, blur_s, found, begun_anew(dead, lost), lost, faulty, films)
+
+
+def searched_with(dead: DeadTime) -> dict[str, Any]:
+    """What `find_photoreceptor` is told of the intervals between events."""
+    return {"shortest_s": dead.shortest_s, "sharp": dead.measured}
+
+
+def begun_anew(dead: DeadTime, lost: Lost | None) -> DeadTime:
+    """The dead time of pixels that lose contrast in it: it is shorter than their intervals."""
+    return dead if lost is None else DeadTime(lost.dead_s, lost.std_s)
 
 
 def agree(before: FrontEnd, now: FrontEnd) -> bool:

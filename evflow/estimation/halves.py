@@ -14,6 +14,7 @@ import numpy as np
 
 from evflow.estimation.dead_time import dead_time, first_events
 from evflow.estimation.finish import estimate
+from evflow.estimation.front_end import begun_anew, searched_with
 from evflow.estimation.refine import Stretch, find_photoreceptor, make_chunk, simulated_part
 from evflow.estimation.refine.path import STEPS
 from evflow.estimation.refine.photoreceptor import receptor_places
@@ -79,14 +80,15 @@ def _on_its_own(first: FirstPart) -> State:
     """The state with photoreceptor and dead time as measured on the first part itself."""
     state, front_end = first.state, first.state.front_end
     runs, searched = ([(s.recording, s.run) for s in part] for part in (state.read, first.searched))
-    found = front_end.found
-    if found is not None and receptor_places(runs) != receptor_places(searched):
-        found = find_photoreceptor(runs, front_end.noise_dn)
-    seen_by = found.used if found is not None else IDEAL
     events = state.read[0].recording.events
     end = int(state.read[0].recording.frame_times[first.rest[0]])
     dead = dead_time(first_events(events.slice(int(events.t[0]), end)))
-    own = dataclasses.replace(front_end, seen_by=seen_by, found=found, dead=dead, films={})
+    found, lost = front_end.found, front_end.lost
+    if found is not None and receptor_places(runs) != receptor_places(searched):
+        found, lost = find_photoreceptor(runs, front_end.noise_dn, **searched_with(dead))
+    seen_by = found.used if found is not None else IDEAL
+    own = dataclasses.replace(front_end, seen_by=seen_by, found=found,
+                              dead=begun_anew(dead, lost), lost=lost, films={})
     simulated = spread([len(s.run) for s in state.read], max(len(state.chunks), 1))
     if seen_by != front_end.seen_by:
         state = State(state.params, own)

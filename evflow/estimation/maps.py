@@ -15,7 +15,14 @@ from evflow.camera.optics import Optics
 from evflow.estimation.front_end import FrontEnd
 from evflow.estimation.pixel_noise import pixel_rates, threshold_law, uneven_rate
 from evflow.estimation.pooled import window_inputs
-from evflow.estimation.refine import Chunk, Found, PixelEvidence, pixel_posterior, refine_summary
+from evflow.estimation.refine import (
+    Chunk,
+    Found,
+    Lost,
+    PixelEvidence,
+    pixel_posterior,
+    refine_summary,
+)
 from evflow.network import api
 from evflow.network.coordinates import SCALE, per_channel, unsquash_summary
 from evflow.network.posterior import Evidence, evidence, posterior
@@ -102,6 +109,28 @@ def with_unquiet_error(
     added = UNQUIET * QUIET_HALF / (QUIET_HALF + share) * events / (events + EVENTS_HALF)
     on, off = np.hypot(error, added * rate).astype(np.float32)
     return dataclasses.replace(std, eta_on=jnp.asarray(on), eta_off=jnp.asarray(off))
+
+
+def with_contrast_lost(
+    camera: Camera, std: Camera, summary: Summary, summary_std: Summary, lost: Lost
+) -> tuple[Camera, Camera, Summary, Summary]:
+    """The maps and the summary, and their errors, with thresholds of pixels that lose contrast in
+    their dead time: all above took it as kept."""
+    for p, name in enumerate(("on", "off")):
+        theta, sigma = f"theta_{name}", f"sigma_{name}"
+        camera, std = _lowered(camera, std, theta, lost, p)
+        for what in (theta, sigma):
+            summary, summary_std = _lowered(summary, summary_std, what, lost, p)
+    return camera, std, summary, summary_std
+
+
+def _lowered(values: Any, errors: Any, name: str, lost: Lost, polarity: int) -> tuple[Any, Any]:
+    """A camera or a summary, and its errors, with the field `name` divided by the excess."""
+    by = np.float32(lost.excess[polarity])
+    value, error = (getattr(s, name) / by for s in (values, errors))
+    error = jnp.hypot(error, np.float32(lost.error(polarity)) * value)
+    return (dataclasses.replace(values, **{name: value}),
+            dataclasses.replace(errors, **{name: error}))
 
 
 def refined(

@@ -6,7 +6,7 @@ import numpy as np
 
 from evflow.camera import Summary
 from evflow.camera.optics import Optics
-from evflow.estimation.refine import Found
+from evflow.estimation.refine import Found, Lost
 from evflow.estimation.shot import Shot
 from evflow.network.pooling import Stats
 from evflow.notes import Note
@@ -101,6 +101,19 @@ def receptor_notes(
             "such light; two real DAVIS had 17 and 20 DN. A longer recording, with dark and bright "
             "areas, determines it."))
     return notes
+
+
+def lost_notes(lost: Lost | None) -> list[Note]:
+    if lost is None:
+        return []
+    how = {"drops": "events that fall into it are dropped (as by ESIM)",
+           "resets": "they begin anew at its end (as an amplifier that is held in reset)"}
+    on, off = (100.0 * (x - 1.0) for x in lost.excess)
+    return [Note(
+        "pixels.lost", f"pixels lose contrast in their dead time of {1e3 * lost.dead_s:.1f} ms: "
+        f"{how[lost.law]}. Taken as kept, the thresholds would be {on:.0f} % (ON) and {off:.0f} % "
+        "(OFF) too high. Simulations keep it (as v2e), and have more events where light changes "
+        "fast.")]
 
 
 def noise_notes(shot: Shot) -> list[Note]:

@@ -74,3 +74,12 @@ def test_intervals_are_a_pixel_s_own() -> None:
     assert sorted(own_intervals(events)[0]) == [30, 70]
     assert len(own_intervals(events.slice(0, 0))[0]) == 0
     assert not dead_time(events.slice(0, 0)).measured
+
+
+def test_the_shortest_usual_intervals_are_known_without_a_dead_time() -> None:
+    """They bound the dead time of a pixel that begins anew after it."""
+    intervals = wanted()
+    found = dead_time(stream(intervals))
+    assert not found.measured
+    assert found.shortest_s == pytest.approx(1e-6 * np.quantile(intervals[:, 1:], 0.01), rel=0.05)
+    assert dead_time(Events([], [], [], [], (20, 20))).shortest_s == 0.0

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evflow.camera import Summary
-from evflow.estimation.maps import SLOW_BIAS, regressed
+from evflow.camera import Camera, Summary
+from evflow.estimation.maps import SLOW_BIAS, regressed, with_contrast_lost
+from evflow.estimation.refine import Lost
 from evflow.estimation.refine.receptor_result import STEPPED_LOW, Found
 from evflow.simulator.photoreceptor import TYPICAL, Photoreceptor
 
@@ -64,3 +65,20 @@ def test_all_but_the_thresholds_are_left() -> None:
     summary = regressed(SUMMARY, STD, found(0.9))[0]
     same = dataclasses.replace(summary, theta_on=SUMMARY.theta_on, theta_off=SUMMARY.theta_off)
     assert same == SUMMARY
+
+
+def test_thresholds_of_pixels_that_lose_contrast_are_lowered_and_their_errors_grow() -> None:
+    maps, errors = (Camera(*(np.full((2, 3), v, np.float32) for v in values))
+                    for values in ((0.2, 0.25, 0.1, 0.1), (0.02, 0.02, 0.03, 0.03)))
+    lost = Lost("resets", 2e-3, 1e-4, np.array([1.25, 1.0]))
+    camera, std, summary, summary_std = with_contrast_lost(maps, errors, SUMMARY, STD, lost)
+    for values, wider, before in ((camera, std, errors), (summary, summary_std, STD)):
+        np.testing.assert_allclose(values.theta_on, 0.16, rtol=1e-6)
+        np.testing.assert_allclose(values.theta_off, 0.25, rtol=1e-6)
+        share = lost.error(0)
+        np.testing.assert_allclose(
+            wider.theta_on, np.hypot(np.asarray(before.theta_on) / 1.25, share * 0.16), rtol=1e-6)
+        np.testing.assert_allclose(wider.theta_off, before.theta_off, rtol=1e-6)
+        np.testing.assert_array_equal(values.eta_on, np.float32(0.1))
+    assert float(summary.sigma_on) == pytest.approx(0.03 / 1.25)
+    assert float(summary.sigma_off) == pytest.approx(0.03)

@@ -10,6 +10,7 @@
     the same of one polarity alone --> its threshold     alone.py
     recorded events on the path --> each pixel's theta   pixels.py
     recorded events on the path --> photoreceptor, offset of the frames   photoreceptor.py
+    the same, pixels with a dead time --> contrast lost in it   lost_contrast.py
     recorded events of quiet pixels --> noise rates      noise.py
     events, random points --> rates of noise beside signal   points.py, signal.py
 
@@ -28,6 +29,7 @@ from evflow.estimation.refine.chunk import (
 from evflow.estimation.refine.denoise import frame_noise
 from evflow.estimation.refine.fit import Refined, refine_summary
 from evflow.estimation.refine.fusion import fused
+from evflow.estimation.refine.lost_contrast import Lost
 from evflow.estimation.refine.photoreceptor import find_photoreceptor, receptor_sample
 from evflow.estimation.refine.pixels import PixelEvidence, pixel_posterior
 from evflow.estimation.refine.receptor_result import Found
@@ -36,6 +38,7 @@ from evflow.estimation.refine.stretches import Stretch, cut, plan_runs
 __all__ = [
     "Chunk",
     "Found",
+    "Lost",
     "PixelEvidence",
     "Refined",
     "Stretch",

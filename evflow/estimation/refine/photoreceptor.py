@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from evflow.estimation.refine.lost_contrast import Lost, lost_contrast
 from evflow.estimation.refine.path import STEPS, Films, Place, as_seen, interpolated, of_place
 from evflow.estimation.refine.readouts import without_readouts
 from evflow.estimation.refine.receptor_data import Part, Sample, sample
@@ -61,9 +62,21 @@ def receptor_sample(
 
 
 def find_photoreceptor(
-    places: Sequence[Place], noise_dn: float = 0.0, films: Films | None = None
-) -> Found | None:
-    """The photoreceptor of a camera and the offset and delay of its frames; None with too few
-    events. Arguments as of `receptor_sample`."""
+    places: Sequence[Place], noise_dn: float = 0.0, films: Films | None = None, *,
+    shortest_s: float = 0.0, sharp: bool = False,
+) -> tuple[Found | None, Lost | None]:
+    """The photoreceptor of a camera and the offset and delay of its frames, and the contrast that
+    its pixels lose in their dead time.
+
+    Args:
+        places, noise_dn, films: as of `receptor_sample`.
+        shortest_s, sharp: as of `lost_contrast`; 0 where no shortest intervals are known.
+
+    Returns:
+        The photoreceptor, None with too few events; and what is lost, None if it is kept.
+    """
     data = receptor_sample(places, noise_dn, films)
-    return find(data) if data is not None else None
+    found = find(data) if data is not None else None
+    if data is None or found is None or not shortest_s:
+        return found, None
+    return lost_contrast(data, found, shortest_s, sharp=sharp)

@@ -38,7 +38,8 @@ class Sample(NamedTuple):
     constant: those of a pixel, divided at readouts (readouts.py) and noise (receptor_noise.py).
     block: (C, P); noise_hz: (C, 2), of `noise_rates`; watched: (C,) pixel seconds of all pixels;
     net_offset: (C, len(MAPS), 2) offset of the frames and its std by net_changes.py, of all
-    stretches, with each log map."""
+    stretches, with each log map; lost: (C, N) log units, the pixel's contrast lost in dead times so
+    far (lost_contrast.py), None if it is kept."""
 
     dn: Array
     dt_s: Array
@@ -52,6 +53,12 @@ class Sample(NamedTuple):
     noise_hz: Array
     watched: Array
     net_offset: Array | None = None
+    lost: Array | None = None
+
+
+def one_stretch(data: Sample, c: int) -> Sample:
+    """The fields of stretch c, without its axis, as NumPy arrays."""
+    return jax.tree.map(lambda v: np.asarray(v[c]), data)
 
 
 def sample(

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from evflow.estimation.refine.receptor_data import Sample
+from evflow.estimation.refine.receptor_data import Sample, one_stretch
 from evflow.estimation.refine.sightings import TYPICAL_THETA
 from evflow.simulator.photoreceptor import FAST, Photoreceptor, seen_path
 
@@ -37,19 +37,14 @@ def split_at_noise(data: Sample, seen_by: Photoreceptor, theta: Array | None = N
         return data
     scale = np.full(2, TYPICAL_THETA) if theta is None else np.maximum(theta, TYPICAL_THETA)
 
-    def stretch(c: int) -> Sample:
-        return jax.tree.map(lambda v: np.asarray(v[c]), data)
-
-    groups = [_groups(stretch(c), seen_by, noise_hz, scale) for c in range(len(data.dn))]
+    groups = [_groups(one_stretch(data, c), seen_by, noise_hz, scale)
+              for c in range(len(data.dn))]
     return data._replace(group=jnp.asarray(np.stack(groups)))
 
 
 def _groups(d: Sample, seen_by: Photoreceptor, noise_hz: Array, theta: Array) -> Array:
     """(N,) int32 groups of one stretch."""
-    step_s = float(np.mean(d.dt_s))
-    path = np.asarray(_seen(d.dn, d.dt_s, np.float32(seen_by.offset_dn),
-                            np.float32(max(seen_by.tau_s, FAST)), seen_by.by_light,
-                            seen_by.logarithmic))
+    step_s, path = float(np.mean(d.dt_s)), path_of(d, seen_by)
     used = np.flatnonzero(np.asarray(d.weight) > 0)
     at, pixel, on, part = (np.asarray(v)[used] for v in (d.at, d.pixel, d.on, d.group))
     last = len(path) - 1
@@ -65,6 +60,13 @@ def _groups(d: Sample, seen_by: Photoreceptor, noise_hz: Array, theta: Array) ->
     new |= np.diff(part, prepend=-1) != 0
     group[used] = np.cumsum(new | (noise > LIKELY * (noise + cause_hz))) - 1
     return group
+
+
+def path_of(d: Sample, seen_by: Photoreceptor) -> Array:
+    """(T + 1, P) path of one stretch, log units, as the pixels see it but for its delay."""
+    return np.asarray(_seen(d.dn, d.dt_s, np.float32(seen_by.offset_dn),
+                            np.float32(max(seen_by.tau_s, FAST)), seen_by.by_light,
+                            seen_by.logarithmic))
 
 
 _seen = jax.jit(seen_path)

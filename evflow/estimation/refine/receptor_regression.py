@@ -140,10 +140,12 @@ def _products(
         if slopes:
             s, along = jax.linearize(path, phi[:2])
             y, fall = looked_up(s)
+            y = y if d.lost is None else y - d.lost
             tangents = [looked_up(along(e))[0] for e in jnp.eye(2, dtype=phi.dtype)]
             columns = [d.on, d.off, y, *tangents, fall / step_s]
         else:
-            columns = [d.on, d.off, looked_up(path(phi[:2]))[0]]
+            y = looked_up(path(phi[:2]))[0]
+            columns = [d.on, d.off, y if d.lost is None else y - d.lost]
 
         def total(v: Array) -> Array:
             return jax.ops.segment_sum(v, d.group, EVENTS)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from evflow.estimation.refine import receptor_search
+from evflow.estimation.refine.lost_contrast import lost_contrast
 from evflow.estimation.refine.path import STEPS
 from evflow.estimation.refine.receptor_data import Sample, sample
 from evflow.estimation.refine.receptor_prior import FEW, FEWER, small_sample_odds
@@ -123,9 +124,14 @@ def looked_at(
     tau_s = 1 / (2 * np.pi * cutoff_hz) if cutoff_hz else 0.0
     seen = integrated(dn, dt_s, offset, tau_s, SUB, by_light, log)
     events = events_of(seen, dt_s / SUB, delay_s, 0.25, 0.2, noise_hz)
+    return sample_of(dn, events)
+
+
+def sample_of(dn: np.ndarray, events: Events) -> Sample:
+    """The sample of events beside a film."""
     times = 10_000 + np.round(np.arange(INTERVALS + 1) * FRAME_S * 1e6).astype(np.int64)
     s = sight(events, times, lin_log(dn).astype(np.float32), STEPS)
-    steps_s = np.full(INTERVALS * STEPS, dt_s)
+    steps_s = np.full(INTERVALS * STEPS, FRAME_S / STEPS)
     data = sample([(dn.astype(np.float32), steps_s, s, no_readouts(s), NONE_HOT)])
     assert data is not None
     return data
@@ -288,3 +294,44 @@ def test_the_less_probable_law_widens_what_is_left_open() -> None:
         3e-3, np.array([0.2, 0.3]), np.diag([4.0, 1e-8, 1e-8]), np.array([0.1, 0.0]))
     assert covariance == pytest.approx(np.diag([4.0, 1e-8 + 0.25 * 4e-6, 1e-8]))
     assert theta_error == pytest.approx([0.1, 0.5 * np.log(2)])
+
+
+DEAD_S = 5e-3
+
+
+def dead_events(path: np.ndarray, dt_s: float, law: str) -> Events:
+    """Events of pixels, of .25 and .2, that are dead for DEAD_S after each: one instant at a time.
+    "keeps" fires for what changed meanwhile, "drops" loses events, "resets" begins anew."""
+    memory, last = path[0].copy(), np.full(path.shape[1:], -1.0)
+    rows = []
+    for i, now in enumerate(path[1:], 1):
+        ready = i * dt_s - last >= DEAD_S
+        if law == "resets":
+            memory = np.where(ready, memory, now)
+        while (crossed := (now - memory > 0.25) | (memory - now > 0.2)).any():
+            crossed &= ready | (law == "drops")
+            if not crossed.any():
+                break
+            up, fires = now > memory, crossed & ready
+            memory = memory + np.where(up, 0.25, -0.2) * crossed
+            last, ready = np.where(fires, i * dt_s, last), ready & ~fires
+            y, x = np.nonzero(fires)
+            rows.append(np.stack([x, y, np.full(len(x), round(i * dt_s * 1e6)), up[fires]]))
+    x, y, t, p = np.concatenate(rows, 1)
+    return Events(x, y, t + 10_000, p > 0, SHAPE[::-1])
+
+
+@pytest.mark.parametrize("law", ["keeps", "drops", "resets"])
+def test_contrast_lost_in_dead_times_is_told_from_contrast_kept(law: str) -> None:
+    """Taken as kept, these thresholds would come out up to twice too high."""
+    dn, dt_s = film(), FRAME_S / STEPS
+    seen = integrated(dn, dt_s, 0.0, 0.0, SUB)
+    data = sample_of(dn, dead_events(seen, dt_s / SUB, law))
+    shortest_s, sharp = (1.3 * DEAD_S, False) if law == "resets" else (DEAD_S, True)
+    found, lost = lost_contrast(data, find(data), shortest_s, sharp=sharp)
+    assert (lost.law if lost else "keeps") == law
+    theta = found.theta / (lost.excess if lost else 1.0)
+    np.testing.assert_allclose(theta, [0.25, 0.2], rtol=0.08)
+    if lost:
+        assert lost.dead_s == pytest.approx(DEAD_S, rel=0.12)
+        assert min(lost.excess) > 1.1

@@ -1,0 +1,158 @@
+"""Contrast that pixels lose in their dead time, by which thresholds come out too high.
+
+Three kinds of pixel have a dead time. v2e's keeps what changes meanwhile, and fires for it
+afterwards. ESIM's drops the events that fall into it, but its memory follows. One whose amplifier
+is held in reset (Lichtsteiner et al. 2008; Deblur e-NeRF) begins anew at its end. If the path's
+changes within the dead times are taken out as the right kind loses them, the pooled regression
+(receptor_regression.py) explains most.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Literal, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from evflow.estimation.refine.receptor_data import Sample, one_stretch
+from evflow.estimation.refine.receptor_noise import path_of
+from evflow.estimation.refine.receptor_regression import Regression
+from evflow.estimation.refine.receptor_result import Found
+from evflow.estimation.refine.receptor_search import BELIEVED, find
+from evflow.simulator.photoreceptor import FAST, Photoreceptor
+
+Array = np.ndarray
+Law = Literal["drops", "resets"]
+
+CLEARLY = 6.0  # log odds required against a pixel that keeps its contrast
+# A pixel that begins anew needs a threshold's worth of change after its dead time, which is
+# therefore a part of its shortest intervals: these parts are tried, and then those about the best.
+COARSE, FINE = (0.25, 0.5, 0.75, 1.0), np.arange(-0.2, 0.21, 0.05)
+LEAST = 1e-3  # log units, of a threshold
+ROUNDS = 3  # of thresholds and whole events lost, each from the other
+SHARE_ERROR = 0.3  # of the correction, in logarithms: measured with dead times of 2 to 5 ms
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Lost:
+    """law: how the contrast is lost; dead_s: the dead time in seconds, and std_s its error; excess:
+    (2,) factors by which theta_on and theta_off come out too high if it is taken as kept."""
+
+    law: Law
+    dead_s: float
+    std_s: float
+    excess: Array
+
+    def error(self, polarity: int) -> float:
+        """Relative error of a threshold that is divided by its excess."""
+        return SHARE_ERROR * abs(float(np.log(self.excess[polarity])))
+
+
+def lost_contrast(
+    data: Sample, found: Found, shortest_s: float, *, sharp: bool
+) -> tuple[Found, Lost | None]:
+    """Whether and how pixels lose contrast in their dead time.
+
+    Args:
+        data: the sample in which the photoreceptor was searched for.
+        found: that search, for pixels that keep their contrast.
+        shortest_s: a pixel's shortest usual intervals, in seconds.
+        sharp: whether there are hardly any shorter ones, as where they are the dead time itself.
+
+    Returns:
+        The search for pixels as they are, with thresholds as if contrast were kept, and how it is
+        lost; `found` and None if it is kept.
+    """
+    size = 0.5 * min(found.size, BELIEVED)
+    tried = [way for seen_by in dict.fromkeys((found.ideal, found.used))
+             for way in _ways(data, seen_by, shortest_s, sharp=sharp)]
+    best = max(tried, key=lambda way: way.gain)
+    if size * best.gain < CLEARLY:
+        return found, None
+    if best.law == "resets":
+        finer = best.dead_s + FINE * shortest_s
+        best = max((_way(data, best.seen_by, "resets", dead_s) for dead_s in finer[finer > 0]),
+                   key=lambda way: way.gain)
+    again = find(best.data)
+    if again is None:
+        return found, None
+    before, after = (1.0 - f.explained[int(f.needed)] for f in (found, again))
+    if size * np.log(before / after) < CLEARLY:
+        return found, None
+    excess = np.divide(*(_solved(some, again.used)[0] for some in (data, best.data)))
+    error = float(FINE[1] - FINE[0]) if best.law == "resets" else 0.02
+    return (dataclasses.replace(again, theta=again.theta * excess,
+                                ideal_theta=again.ideal_theta * excess),
+            Lost(best.law, best.dead_s, error * shortest_s, excess))
+
+
+class Way(NamedTuple):
+    """A way to lose contrast. gain: of the log of the share that is not explained; seen_by: the
+    photoreceptor; data: the sample with that contrast taken out."""
+
+    gain: float
+    law: Law
+    dead_s: float
+    seen_by: Photoreceptor
+    data: Sample
+
+
+def _ways(
+    data: Sample, seen_by: Photoreceptor, shortest_s: float, *, sharp: bool
+) -> Iterator[Way]:
+    if sharp:
+        yield _way(data, seen_by, "drops", shortest_s)
+    for share in COARSE:
+        yield _way(data, seen_by, "resets", share * shortest_s)
+
+
+def _way(data: Sample, seen_by: Photoreceptor, law: Law, dead_s: float) -> Way:
+    theta, kept = _solved(data, seen_by)
+    for _ in range(ROUNDS if law == "drops" else 1):
+        whole = np.maximum(np.abs(theta), LEAST) if law == "drops" else None
+        taken_out = _without(data, seen_by, dead_s, whole)
+        theta, left = _solved(taken_out, seen_by)
+    return Way(kept - left, law, dead_s, seen_by, taken_out)
+
+
+def _solved(data: Sample, seen_by: Photoreceptor) -> tuple[Array, float]:
+    """theta (2,) of the regression, and the log of the share that it does not explain."""
+    model = Regression(data, seen_by.by_light, seen_by.log_map)
+    phi = np.array([seen_by.offset_dn, max(seen_by.tau_s, FAST), seen_by.delay_s])
+    return model.solved(phi)[0], model.unexplained(phi)
+
+
+def _without(
+    data: Sample, seen_by: Photoreceptor, dead_s: float, theta: Array | None = None
+) -> Sample:
+    """The sample whose `lost` is the path's change within dead_s after each event so far; theta:
+    (2,) where whole events are dropped, so that it is a multiple of the thresholds."""
+    rows = [_lost(one_stretch(data, c), seen_by, dead_s, theta) for c in range(len(data.dn))]
+    return data._replace(lost=jnp.asarray(np.stack(rows)))
+
+
+def _lost(d: Sample, seen_by: Photoreceptor, dead_s: float, theta: Array | None) -> Array:
+    """(N,) of one stretch."""
+    step_s, path = float(np.mean(d.dt_s)), path_of(d, seen_by)
+    used = np.flatnonzero(d.weight > 0)
+    pixel = np.asarray(d.pixel)[used]
+    at = np.clip(np.asarray(d.at, np.float64)[used] - seen_by.delay_s / step_s,
+                 0.0, len(path) - 1 - 1e-3)
+
+    def light(when: Array) -> Array:
+        step = when.astype(np.int64)
+        before, after = path[step, pixel], path[step + 1, pixel]
+        return before + (when - step) * (after - before)
+
+    first = np.diff(pixel, prepend=-1) != 0
+    last = np.where(first, at, np.roll(at, 1))
+    change = light(np.minimum(last + dead_s / step_s, at)) - light(last)
+    if theta is not None:
+        each = np.where(change > 0, *theta)
+        change = np.trunc(change / each) * each
+    total = np.cumsum(change)
+    lost = np.zeros(len(d.weight), np.float32)
+    lost[used] = total - total[np.maximum.accumulate(np.where(first, np.arange(len(at)), 0))]
+    return lost
