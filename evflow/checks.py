@@ -89,6 +89,16 @@ def check_exposure(exposure_us: float) -> int:
     return int(exposure_us)
 
 
+def check_full_scale(full_scale: float) -> int:
+    """The DN of a saturated pixel, a whole number 0..65535, as an int; raises EV020."""
+    one = isinstance(full_scale, int | float | np.number)
+    if not (one and 0 <= full_scale < 2**16 and full_scale == int(full_scale)):
+        raise EvflowDataError(
+            "EV020", f"full_scale={full_scale!r:.60}.", "Give the DN of a saturated pixel, such as "
+            "1023 for 10 bits or 4095 for 12; 0 if it is unknown.")
+    return int(full_scale)
+
+
 def check_times(t: np.ndarray, name: str, *, strict: bool) -> np.ndarray:
     """Times (N,) as sorted int64 (strict: strictly increasing); raises EV003, EV004."""
     if t.size == 0:

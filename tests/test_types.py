@@ -183,6 +183,11 @@ def test_concatenate_refuses_other_order_and_sizes() -> None:
     ({"frames": np.zeros((2, 6, 4), np.uint8)}, "EV015", "Swap width and height"),
     ({"frames": np.zeros((2, 5, 5), np.uint8)}, "EV015", "frames are 5x5"),
     ({"exposure_us": "a"}, "EV020", "exposure_us='a'"),
+    ({"full_scale": float("nan")}, "EV020", "full_scale=nan"),
+    ({"full_scale": 1e9}, "EV020", "full_scale=1000000000.0"),
+    ({"full_scale": 4095.5}, "EV020", "full_scale=4095.5"),
+    ({"full_scale": "1023"}, "EV020", "1023 for 10 bits"),
+    ({"full_scale": -1}, "EV020", "full_scale=-1"),
 ])
 def test_bad_recordings_say_what_where_and_the_fix(changed: dict, code: str, seen: str) -> None:
     given_ = {"events": events(), "frames": frames(), "frame_times": [5, 11]} | changed

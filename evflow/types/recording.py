@@ -6,7 +6,15 @@ import dataclasses
 
 import numpy as np
 
-from evflow.checks import check_exposure, check_frames, check_times, need, plain, read_only
+from evflow.checks import (
+    check_exposure,
+    check_frames,
+    check_full_scale,
+    check_times,
+    need,
+    plain,
+    read_only,
+)
 from evflow.errors import EvflowDataError
 from evflow.files.spool import forget
 from evflow.notes import Note
@@ -34,8 +42,8 @@ class Recording:
     Raises:
         EvflowDataError: EV002 (shape, or colour), EV003 (dtype, or range of float frames), EV004
             (times do not increase), EV007 (NaN), EV015 (frames and events of different size),
-            EV020 (`events` is not an `Events`, `notes` are not `Note`s, or the exposure is
-            negative).
+            EV020 (`events` is not an `Events`, `notes` are not `Note`s, the exposure is negative,
+            or full_scale no whole number 0..65535).
 
     Example:
         >>> recording = ef.Recording(events, frames, frame_times)
@@ -62,7 +70,8 @@ class Recording:
         for note in self.notes:
             need(note, Note, "a note", "For a sentence: evflow.notes.Note(code, sentence).")
         object.__setattr__(self, "exposure_us", check_exposure(self.exposure_us))
-        object.__setattr__(self, "full_scale", _white(frames, self.full_scale))
+        object.__setattr__(self, "full_scale",
+                           _white(frames, check_full_scale(self.full_scale)))
         object.__setattr__(self, "frames", read_only(frames))
         object.__setattr__(self, "frame_times", read_only(times))
 
