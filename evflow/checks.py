@@ -21,16 +21,17 @@ MOST_SIDE = 1 << 16  # pixels; coordinates of events have 16 bits
 RESET_US = 1_000_000  # a step back by more than this is another clock, not a late packet
 
 
-def plain(name: str, value: Any) -> Any:
+def plain(name: str, value: Any, unknown: str = "0") -> Any:
     """`value` as a NumPy array in native byte order; JAX arrays pass unchanged. Raises EV003 for
-    masked arrays (the mask would be lost), datetime64 or timedelta64, and objects that are not
-    arrays."""
+    masked arrays (the mask would be lost; `unknown` is what may fill it), datetime64 or
+    timedelta64, and objects that are not arrays."""
     if hasattr(value, "aval"):
         return value
     if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
         raise EvflowDataError(
             "EV003", f"{name} has {np.ma.count_masked(value):,} masked values, which would be "
-            "treated as valid.", "Remove or fill them: value.compressed(), value.filled(0).")
+            "treated as valid.",
+            f"Remove or fill them: value.compressed(), value.filled({unknown}).")
     try:
         array = np.asarray(value)
     except EvflowDataError:

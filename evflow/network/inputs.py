@@ -101,6 +101,12 @@ def prepare(
 
 
 def _intensity(values: ArrayLike, shape: tuple[int, ...]) -> Array:
+    values = plain("intensity", values, "np.nan")
+    if np.shape(values) not in ((), shape[:-2]) and np.shape(values)[-2:] != shape[-2:]:
+        raise EvflowDataError(
+            "EV002", f"intensity has shape {np.shape(values)}, the pixels {shape}.",
+            f"Give one value for each pixel, {shape}, or for each window, "
+            f"{shape[:-2] or 'a number'}.")
     if not isinstance(values, jax.core.Tracer):
         given = np.asarray(values)
         if not is_real(given.dtype):

@@ -258,6 +258,10 @@ def without_summary(params: Any) -> Any:
     ("EV018", lambda p, v, d: api.finish(without_summary(p), api.summarize(p, v, d))),
     ("EV002", lambda p, v, d: api.estimate(p, v, d, window_s=np.full(3, 0.05))),
     ("EV002", lambda p, v, d: api.estimate(p, v, d, intensity=d.T[:2] * 0)),
+    ("EV002", lambda p, v, d: api.estimate(p, v, d, intensity=np.full(d.shape[1], 3.0))),
+    ("EV002", lambda p, v, d: api.estimate(p, v, d, intensity=np.full((d.shape[0], 1), 3.0))),
+    ("EV003", lambda p, v, d: api.estimate(p, v, d, intensity=np.ma.masked_less(
+        np.full(d.shape, 3.0) + np.eye(*d.shape), 3.5))),
     ("EV003", lambda p, v, d: api.estimate(p, v, d, intensity=np.full(d.shape, 128.0))),
     ("EV007", lambda p, v, d: api.estimate(p, v, d, intensity=np.full(d.shape, np.inf))),
     ("EV002", lambda p, v, d: api.forward(p, v[:-1], api.encode(p, v, d))),
