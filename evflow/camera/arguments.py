@@ -1,4 +1,4 @@
-"""Keys, shapes of maps and single numbers, checked at the border; traced ones pass."""
+"""Keys, shapes of maps, numbers and arrays of them at the border; traced ones pass."""
 
 from __future__ import annotations
 
@@ -7,9 +7,14 @@ import operator
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
+from evflow.checks import plain
 from evflow.errors import EvflowDataError
+
+Array = jax.Array
 
 
 def check_key(key: Any) -> None:
@@ -52,3 +57,16 @@ def number(value: Any) -> float:
         return math.nan if np.ndim(value) or isinstance(value, str | bytes) else float(value)
     except (TypeError, ValueError):
         return math.nan
+
+
+def real(values: ArrayLike) -> Array:
+    """Convert to float32; float64 is kept in JAX's x64 mode."""
+    values = plain("the input", values)
+    values = jax.device_put(values) if isinstance(values, np.ndarray) else jnp.asarray(values)
+    return values if values.dtype == jnp.float64 else values.astype(jnp.float32)
+
+
+def real_maps(maps: Any) -> Any:
+    """A camera or summary of `real` arrays: its maps may be lists, integers, or bytes of another
+    order, which JAX would misread."""
+    return type(maps)(*(real(values) for values in vars(maps).values()))

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evflow.camera import file
-from evflow.camera.arguments import check_key, parameter, shape_of_maps
+from evflow.camera.arguments import check_key, parameter, real_maps, shape_of_maps
 from evflow.camera.file import PARAMETERS
 from evflow.camera.prior import CameraPrior, Summary, sample_nominal
 from evflow.checks import need, plain
@@ -137,13 +137,14 @@ class Camera:
         if std.shape != self.shape:
             raise EvflowDataError("EV015", f"standard deviations of shape {std.shape} for maps of "
                                   f"shape {self.shape}.", "Give those of this camera.")
-        kind, count = jnp.result_type(self.theta_on), len(PARAMETERS)
+        camera, std = real_maps(self), real_maps(std)
+        kind, count = jnp.result_type(camera.theta_on), len(PARAMETERS)
         draws = jax.random.normal(key, (count, *self.shape), kind)
         once = jax.random.normal(
             jax.random.fold_in(key, count), (count, *self.shape[:-2], 1, 1), kind)
         least, maps = {"theta_on": THETA_MIN, "theta_off": THETA_MIN}, {}
         for name, draw, common in zip(PARAMETERS, draws, once, strict=True):
-            value, error, part = getattr(self, name), getattr(std, name), (shared or {}).get(name)
+            value, error, part = getattr(camera, name), getattr(std, name), (shared or {}).get(name)
             if part:
                 error = jnp.sqrt(jnp.maximum(error**2 - (part * value) ** 2, 0.0))
             pixels = value + error * draw

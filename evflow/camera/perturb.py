@@ -18,6 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import Camera
+from evflow.camera.arguments import check_key, real_maps
+from evflow.checks import need
 from evflow.errors import EvflowDataError
 
 Array = jax.Array
@@ -47,8 +49,10 @@ def with_faults(
         A camera of the same shape.
 
     Raises:
-        EvflowDataError: EV020 (impossible shares or rates).
+        EvflowDataError: EV002, EV014, EV015 (no valid camera), EV020 (impossible shares or rates;
+            no key or camera).
     """
+    camera = _checked(key, camera)
     if not (hot >= 0 and dead >= 0 and hot + dead <= 1):
         raise EvflowDataError("EV020", f"hot={hot}, dead={dead}.",
                               "Give shares of the pixels, >= 0 and at most 1 together.")
@@ -70,6 +74,14 @@ def with_faults(
 
     return Camera(theta(camera.theta_on), theta(camera.theta_off),
                   eta(camera.eta_on, rates[0]), eta(camera.eta_off, rates[1]))
+
+
+def _checked(key: Array, camera: Camera) -> Camera:
+    """The validated camera, of float maps; EV020 without a key or a camera."""
+    check_key(key)
+    need(camera, Camera, "camera", "For example that of Camera.sample or Camera.load.")
+    maps: Camera = real_maps(camera.validate())
+    return maps
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -180,7 +192,14 @@ def with_noise_histogram(
 
     Returns:
         A camera of the same shape, eta in Hz.
+
+    Raises:
+        EvflowDataError: EV002, EV014, EV015 (no valid camera), EV020 (no key, camera or
+            histogram).
     """
+    camera = _checked(key, camera)
+    for histogram in (on, off):
+        need(histogram, NoiseHistogram, "noise", "Give those of read_noise_histogram.")
     sizes = [len(h.counts) for h in (on, off)]
     k_on, k_off = jax.random.split(key)
     k_off = k_on if sizes[0] == sizes[1] else k_off

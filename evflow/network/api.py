@@ -23,6 +23,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from evflow.camera import Camera, Summary
+from evflow.camera.arguments import real
 from evflow.errors import EvflowDataError
 from evflow.network import architecture, coordinates, inference
 from evflow.network.architecture import Params, config_of
@@ -39,7 +40,7 @@ from evflow.network.bijection import (
 )
 from evflow.network.config import ModelConfig
 from evflow.network.coordinates import Output, camera_std, squash_summary, unsquash_summary
-from evflow.network.inputs import check_finite, given_summary, prepare, real, same_precision
+from evflow.network.inputs import check_finite, given_summary, prepare, same_precision
 from evflow.network.pooling import Stats
 from evflow.network.posterior import of_window
 from evflow.network.summary import finish, pooled_y, summarize

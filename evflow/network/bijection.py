@@ -18,7 +18,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from evflow.camera import Camera, Summary
-from evflow.camera.arguments import check_key
+from evflow.camera.arguments import check_key, real
 from evflow.camera.optics import Optics
 from evflow.camera.sensors import SensorModel
 from evflow.checks import need
@@ -32,7 +32,6 @@ from evflow.network.inputs import (
     check_finite,
     check_shape,
     prepare,
-    real,
     same_precision,
     summary_of_pixels,
 )

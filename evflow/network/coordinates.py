@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import Camera, Summary
+from evflow.camera.arguments import real_maps
 
 Array = jax.Array
 Output = Literal["log", "tanh"]
@@ -41,6 +42,7 @@ def squash(y: Array, output: Output = "log") -> Camera:
 
 def unsquash(camera: Camera, output: Output = "log") -> Array:
     """Camera of maps (...) -> y (..., 4); eta below 1e-3 Hz is taken as 1e-3 Hz."""
+    camera = real_maps(camera)
     if output == "tanh":
         values = jnp.stack([camera.theta_on, camera.theta_off, camera.eta_on, camera.eta_off], -1)
         return jnp.arctanh(jnp.clip(values, -TANH_EDGE, TANH_EDGE))

@@ -14,6 +14,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from evflow.camera import Camera, Summary
+from evflow.camera.arguments import real, real_maps
 from evflow.checks import plain
 from evflow.errors import EvflowDataError
 from evflow.light.log_maps import check_log
@@ -23,13 +24,6 @@ Array = jax.Array
 
 MOST_CHANGE = 7.0  # log units: above black to white, in lin-log and in log(DN / 255 + .001)
 LONGEST_WINDOW_S = 10.0  # a hundred times the longest in training: more is probably microseconds
-
-
-def real(values: ArrayLike) -> Array:
-    """Convert to float32; float64 is kept in JAX's x64 mode."""
-    values = plain("the input", values)
-    values = jax.device_put(values) if isinstance(values, np.ndarray) else jnp.asarray(values)
-    return values if values.dtype == jnp.float64 else values.astype(jnp.float32)
 
 
 def same_precision(values: Array, tree: Any) -> Any:
@@ -187,7 +181,8 @@ def camera_summary(camera: Camera) -> Summary:
 def summary_of_pixels(camera: Camera, shape: tuple[int, ...]) -> Summary:
     """The summary (...,) of a camera with maps (..., H, W) or (H, W), for pixels of this shape;
     raises EV014, EV015."""
-    lead = camera.validate().shape[:-2]
+    camera = real_maps(camera.validate())
+    lead = camera.shape[:-2]
     if camera.shape[-2:] != shape[-2:] or lead not in ((), shape[:-2]):
         raise EvflowDataError(
             "EV015", f"the camera has shape {camera.shape}, the pixels {shape}.",

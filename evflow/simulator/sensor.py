@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import Camera
+from evflow.camera.arguments import real_maps
 from evflow.camera.camera import THETA_MIN
 from evflow.errors import EvflowDataError
 from evflow.light.log_maps import LOG_MAPS, normalised_intensity
@@ -28,9 +29,9 @@ Clock = tuple[Array, Array]  # begin and end of an interval, see `SimState.time`
 
 
 def simulable(camera: Camera) -> Camera:
-    """The validated camera. Raises EV002, EV014, EV015, also for thresholds as small as rounding
-    errors of brightness. Traced maps pass unchecked."""
-    camera.validate()
+    """The validated camera, of float maps. Raises EV002, EV014, EV015, also for thresholds as small
+    as rounding errors of brightness. Traced maps pass unchecked."""
+    camera = real_maps(camera.validate())
     if any(isinstance(m, jax.core.Tracer) for m in jax.tree.leaves(camera)):
         return camera
     for name in ("theta_on", "theta_off"):

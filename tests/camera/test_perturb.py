@@ -273,3 +273,25 @@ def test_measured_noise_keeps_the_dtype_in_x64() -> None:
         for made in (with_faults(KEY, camera), with_noise_histogram(
                 KEY, camera, histogram, histogram)):
             assert {m.dtype for m in jax.tree.leaves(made)} == {jnp.dtype("float64")}
+
+
+@pytest.mark.parametrize("kind", [">f4", ">f8", "list"])
+def test_maps_may_be_lists_or_bytes_of_another_order(kind: str) -> None:
+    camera = Camera.sample(KEY, (4, 5))
+    maps = [np.asarray(m) for m in jax.tree.leaves(camera)]
+    other = Camera(*(m.tolist() if kind == "list" else m.astype(kind) for m in maps))
+    noise, video = NoiseHistogram(np.ones((3, 71))), np.full((2, 4, 5), [[[50]], [[200]]], np.uint8)
+    for change in (lambda c: with_faults(KEY, c, 0.1), lambda c: c.drawn(KEY, c),
+                   lambda c: with_noise_histogram(KEY, c, noise, noise)):
+        assert bytes_of(change(other)) == bytes_of(change(camera))
+    one, two = (simulate(KEY, video, [0, 1000], c) for c in (camera, other))
+    np.testing.assert_array_equal(one.t, two.t)
+
+
+@pytest.mark.parametrize("call", [
+    lambda camera, noise: with_faults(0, camera), lambda camera, noise: with_faults(KEY, None),
+    lambda camera, noise: with_noise_histogram(0, camera, noise, noise),
+    lambda camera, noise: with_noise_histogram(KEY, camera, noise, "dark.npz")])
+def test_what_is_no_key_camera_or_histogram_is_refused(call: Callable) -> None:
+    with pytest.raises(EvflowDataError, match="EV020"):
+        call(Camera.constant((4, 5)), NoiseHistogram(np.ones((3, 71))))

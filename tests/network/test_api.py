@@ -116,6 +116,15 @@ def test_bytes_of_another_order_are_numbers_all_the_same() -> None:
         api.estimate(small_params(), given[0], hidden)
 
 
+@pytest.mark.parametrize("kind", [">f4", "list"])
+def test_maps_may_be_lists_or_bytes_of_another_order(kind: str) -> None:
+    _, dL, camera = seen()
+    maps = [np.asarray(m) for m in jax.tree.leaves(camera)]
+    other = Camera(*(m.tolist() if kind == "list" else m.astype(kind) for m in maps))
+    for of in (unsquash, lambda c: api.code_from_video(small_params(), dL, c).summary):
+        jax.tree.map(np.testing.assert_array_equal, of(other), of(camera))
+
+
 def test_nothing_rests_on_implicit_dtypes() -> None:
     voxels, dL, camera = seen()
     slow = SensorModel(cutoff_hz=50.0)
