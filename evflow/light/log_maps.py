@@ -16,6 +16,7 @@ from jax.typing import ArrayLike
 
 from evflow.checks import plain
 from evflow.errors import EvflowDataError
+from evflow.light.ranges import check_bits
 
 DEPTHS = (np.dtype(np.uint8), np.dtype(np.uint16))  # dtypes whose maximum is white
 
@@ -30,6 +31,8 @@ MOST_LOG = 6.0  # above the logarithm of 255 DN
 MOST_OF_ONE = 12.0  # for a single pixel: a thousand times as bright as white
 SAMPLED = 61  # stride of the values that are compared with it
 BELOW_BLACK = -1e-3  # lin-log begins at 0, but for rounding
+TO_DN = ("Scale both: evflow.light.log_maps.to_dn(frame, {:g}); if they are really that dark: "
+         "to_dn(frame, 65535).")
 MOST_EPS = 0.1  # mean of `log_eps`, which ends at .001: above, the average would outshine white
 
 
@@ -172,7 +175,8 @@ def delta_log_intensity(frame0: ArrayLike, frame1: ArrayLike) -> Array:
 
     Args:
         frame0: (..., H, W) grey frames at the start of the window: uint8, floats on 0..255 DN, or
-            uint16 on 0..65535 (`evflow.light.log_maps.to_dn` for fewer bits).
+            uint16 on 0..65535 (`evflow.light.log_maps.to_dn` for fewer bits: values that all lie
+            below 4096 are refused).
         frame1: frames at its end, of the same shape.
 
     Returns:
@@ -193,6 +197,8 @@ def delta_log_intensity(frame0: ArrayLike, frame1: ArrayLike) -> Array:
     if len({f.dtype for f in (before, after) if f.dtype in DEPTHS}) > 1:
         raise EvflowDataError("EV003", f"the frames are {before.dtype} and {after.dtype}.",
                               "They are on different scales: evflow.light.log_maps.to_dn on each.")
+    if before.dtype == np.uint16 == after.dtype and not isinstance(before, jax.core.Tracer):
+        check_bits(max(int(np.max(f, initial=0)) for f in (before, after)), TO_DN)
     return to_log(after) - to_log(before)
 
 

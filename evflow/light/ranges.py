@@ -18,6 +18,8 @@ DIM_DN = 64.0  # if no frame exceeds it, white may lie elsewhere
 FEW_BITS = 4095  # uint16 that no frame exceeds are 12 bits or fewer
 MOST_LOG = 6.0  # the logarithm of 255 DN is 5.54
 LOG_MEDIAN = 1.0  # logarithms of DN are mostly above it, radiance mostly below
+OF_WHITE = ("Pass the value of white: --full-scale {:g} (full_scale=); if they are really that "
+            "dark: --full-scale 65535.")
 AS_THEY_ARE = "if they are really that dark: --full-scale 255 (full_scale=255)"
 
 
@@ -66,14 +68,13 @@ def likely_white(high: float) -> float:
     return next((white for white in usual if high <= white), high)
 
 
-def check_bits(peak: int) -> None:
+def check_bits(peak: int, fix: str = OF_WHITE) -> None:
     """Raise EV003 if uint16 frames whose largest value is `peak` hold fewer bits than 16; entirely
-    black ones pass."""
+    black ones pass. fix: the advice, with a place for their likely white."""
     if 0 < peak <= FEW_BITS:
         raise EvflowDataError(
             "EV003", f"no value of the 16-bit frames is above {peak}, where white is 65535.",
-            f"Pass the value of white: --full-scale {likely_white(peak):g} (full_scale=); if they "
-            "are really that dark: --full-scale 65535.")
+            fix.format(likely_white(peak)))
 
 
 def _negative(frame: np.ndarray, low: float, high: float) -> Meaning:

@@ -146,6 +146,7 @@ def test_delta_log_intensity_takes_whole_numbers_of_any_kind() -> None:
     for dtype in ("<u2", ">u2"):
         np.testing.assert_allclose(
             delta_log_intensity(*(f.astype(dtype) for f in deep)), expected, atol=1e-5)
+    assert not np.any(delta_log_intensity(*np.zeros((2, 3, 4), np.uint16)))  # black in any scale
     assert code_of(lambda: delta_log_intensity(a.astype(np.uint8), deep[1].astype("<u2"))) == (
         "EV003")  # two scales
 
@@ -161,7 +162,8 @@ def test_delta_log_intensity_refuses_wrong_shapes(a: np.ndarray, b: np.ndarray) 
     (np.full((24, 32, 3), 100, np.uint8), "EV002"), (np.full((2, 3), 0.5), "EV003"),
     (np.full((2, 3), -1.0), "EV003"), (np.full((2, 3), 300.0), "EV003"),
     (np.full((2, 3), np.nan), "EV007"), (np.full((2, 3), -100, np.int16), "EV003"),
-    (np.full((2, 3), 4000, np.int32), "EV003"), (np.ones((2, 3), bool), "EV003"),
+    (np.full((2, 3), 4000, np.int32), "EV003"), (np.full((2, 3), 4095, np.uint16), "EV003"),
+    (jnp.full((2, 3), 1023, jnp.uint16), "EV003"), (np.ones((2, 3), bool), "EV003"),
     (np.full((2, 3), 10 + 1j), "EV003")])
 def test_delta_log_intensity_refuses_what_is_no_gray_dn(frame: np.ndarray, code: str) -> None:
     assert code_of(lambda: delta_log_intensity(frame, frame)) == code
