@@ -24,6 +24,7 @@ from jax.typing import ArrayLike
 
 from evflow.camera import Camera, Summary
 from evflow.camera.arguments import real
+from evflow.checks import need
 from evflow.errors import EvflowDataError
 from evflow.network import architecture, coordinates, inference
 from evflow.network.architecture import Params, config_of
@@ -39,7 +40,13 @@ from evflow.network.bijection import (
     pixel_context,
 )
 from evflow.network.config import ModelConfig
-from evflow.network.coordinates import Output, camera_std, squash_summary, unsquash_summary
+from evflow.network.coordinates import (
+    Output,
+    camera_std,
+    check_output,
+    squash_summary,
+    unsquash_summary,
+)
 from evflow.network.inputs import check_finite, given_summary, prepare, same_precision
 from evflow.network.pooling import Stats
 from evflow.network.posterior import of_window
@@ -65,8 +72,10 @@ def squash(y: ArrayLike, output: Output = "log") -> Camera:
         A camera of maps (...): theta in natural-log units, eta in Hz.
 
     Raises:
-        EvflowDataError: EV002 (shape), EV003 (no real numbers), EV007 (NaN).
+        EvflowDataError: EV002 (shape), EV003 (no real numbers), EV007 (NaN), EV020 (an unknown
+            output).
     """
+    check_output(output)
     if np.ndim(y) < 1 or np.shape(y)[-1] != 4:
         raise EvflowDataError("EV002", f"y has shape {np.shape(y)}.", "Expected (..., 4).")
     check_finite("y", y)
@@ -84,8 +93,11 @@ def unsquash(camera: Camera, output: Output = "log") -> Array:
         float32 (..., 4).
 
     Raises:
-        EvflowDataError: EV014 (a parameter out of range), EV015 (maps of different shapes).
+        EvflowDataError: EV014 (a parameter out of range), EV015 (maps of different shapes), EV020
+            (no camera, or an unknown output).
     """
+    check_output(output)
+    need(camera, Camera, "camera", "For coordinates: squash(y) is their camera.")
     camera.check_values()
     return coordinates.unsquash(camera, output)
 

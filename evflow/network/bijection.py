@@ -64,8 +64,20 @@ def parts(params: Params) -> tuple[ModelConfig, Params]:
     return config_of(params), next(iter(params.values()))
 
 
-def _check_code(code: Code) -> None:
+def _check_code(config: ModelConfig, code: Code) -> None:
+    """Raise EV020 unless it is a code, EV018 if it is of other weights, EV002 if its parts are not
+    of the same pixels."""
     need(code, Code, "code", "Give that of code_from_video(params, dL, camera), or of encode.")
+    width = config.flow.condition if config.code == "feature" else 2 * config.changes
+    changes, context = np.shape(code.changes), np.shape(code.context)
+    if changes[-1:] != (width,):
+        raise EvflowDataError(
+            "EV018", f"the code's changes have shape {changes}, these weights take (..., H, W, "
+            f"{width}).", "Is it of other weights? Make it with these: encode(params, ...).")
+    if context != (*changes[:-1], 3):
+        raise EvflowDataError(
+            "EV002", f"the code's changes have shape {changes}, its context {context}.",
+            f"Both must be of the same pixels; expected a context {(*changes[:-1], 3)}.")
 
 
 def pixel_context(window_s: Array, intensity: Array | None, shape: tuple[int, ...]) -> Array:
@@ -167,10 +179,10 @@ def forward(params: Params, voxels: ArrayLike, code: Code) -> tuple[Array, Array
 
     Raises:
         EvflowDataError: EV002 (voxels and code of different pixels), EV003 (not real numbers),
-            EV007 (NaN), EV018 (not weights), EV020 (not a code).
+            EV007 (NaN), EV018 (not weights, or a code of others), EV020 (not a code).
     """
     config, net = parts(params)
-    _check_code(code)
+    _check_code(config, code)
     check_shape("voxels", voxels, (*code.context.shape[:-1], 2 * config.bins))
     voxels = real(voxels)
     return _forward(net, voxels, same_precision(voxels, code), config=config)
@@ -201,7 +213,7 @@ def inverse(params: Params, y: ArrayLike, z: ArrayLike, code: Code) -> Array:
         EvflowDataError: EV002, EV003, EV007, EV018, EV020 as in `forward`.
     """
     config, net = parts(params)
-    _check_code(code)
+    _check_code(config, code)
     pixels = code.context.shape[:-1]
     for name, values, channels in (("y", y, 4), ("z", z, 2 * config.bins - 4)):
         check_shape(name, values, (*pixels, channels))
@@ -243,13 +255,13 @@ def generate(
 
     Raises:
         EvflowDataError: EV002, EV014 (no valid camera), EV015 (camera of another size), EV018 (not
-            weights, or a sensor with the paper's network), EV020 (a sensor whose low-pass depends
-            on an intensity that the code does not have; no key, camera or code).
+            weights, a code of others, or a sensor with the paper's network), EV020 (a sensor whose
+            low-pass depends on an intensity that the code does not have; no key, camera or code).
     """
     config, _ = parts(params)
     check_key(key)
     need(camera, Camera, "camera", "For example that of estimate_camera: found.camera.")
-    _check_code(code)
+    _check_code(config, code)
     if config.code == "feature" and not photoreceptor(sensor, optics).ideal:
         raise EvflowDataError(
             "EV018", "the paper's condition contains the events, not the light that a low-pass "

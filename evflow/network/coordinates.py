@@ -7,7 +7,7 @@ thresholds, caps rates at 1 Hz and is no bijection at its edges.)
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ import numpy as np
 
 from evflow.camera import Camera, Summary
 from evflow.camera.arguments import real_maps
+from evflow.errors import EvflowDataError
 
 Array = jax.Array
 Output = Literal["log", "tanh"]
@@ -25,6 +26,13 @@ CENTRE = np.log(np.array([0.22, 0.22, 0.12, 0.12], np.float32))
 SCALE = np.array([0.6, 0.6, 1.0, 1.0], np.float32)
 SIGMA_CENTRE, SIGMA_SCALE = np.float32(np.log(0.06)), np.float32(0.8)
 TANH_EDGE = 0.999
+
+
+def check_output(output: str) -> None:
+    """Raise EV020 unless it names one of the coordinates."""
+    if output not in get_args(Output):
+        raise EvflowDataError("EV020", f"output={output!r:.60}.", "Give 'log', or 'tanh' for the "
+                              "paper's network.")
 
 
 def per_channel(values: np.ndarray, like: Array) -> Array:

@@ -248,6 +248,10 @@ def summary(value: Any) -> Summary:
     return Summary(*[jnp.asarray(value, jnp.float32)] * 6)
 
 
+def cropped(params: Any, voxels: Any, dlogI: Any, **altered: Any) -> api.Code:
+    return dataclasses.replace(api.encode(params, voxels, dlogI), **altered)
+
+
 def without_summary(params: Any) -> Any:
     return {name: {k: v for k, v in net.items() if k != "summary"} for name, net in params.items()}
 
@@ -299,7 +303,15 @@ def without_summary(params: Any) -> Any:
     ("EV020", lambda p, v, d: api.generate(p, jax.random.key(0), Camera.constant(d.shape), None)),
     ("EV020", lambda p, v, d: api.forward(p, v, None)),
     ("EV020", lambda p, v, d: api.inverse(p, v[..., :4], v[..., :28], None)),
+    ("EV018", lambda p, v, d: api.forward(p, v, cropped(p, v, d, changes=v[..., :16]))),
+    ("EV018", lambda p, v, d: api.log_prob(p, v, cropped(p, v, d, changes=v[..., :16]))),
+    ("EV018", lambda p, v, d: api.generate(
+        p, jax.random.key(0), Camera.constant(d.shape), cropped(p, v, d, changes=v[..., :16]))),
+    ("EV002", lambda p, v, d: api.forward(p, v, cropped(p, v, d, changes=v[:-1]))),
     ("EV014", lambda p, v, d: unsquash(Camera(*[d * 0 - 0.1] * 4))),
+    ("EV020", lambda p, v, d: unsquash(v[..., :4])),
+    ("EV020", lambda p, v, d: unsquash(Camera.constant(d.shape), "unknown")),  # type: ignore[arg-type]
+    ("EV020", lambda p, v, d: squash(v[..., :4], None)),  # type: ignore[arg-type]
     ("EV002", lambda p, v, d: squash(v[..., :3])),
     ("EV007", lambda p, v, d: squash(v[..., :4] * np.nan)),
 ])
