@@ -144,7 +144,8 @@ def _struck(model: Constants, words: Array, struck: sensor.Struck) -> tuple[Arra
         k = jnp.asarray(tail[2], jnp.uint32)
         rising = noise.event(model, words, struck.drawn, k, struck.odds.share)[1]
         sent = u < tail[0]
-        return noise.next_tail(mean, tail), on + (sent & rising), off + (sent & ~rising)
+        more = [(sent & way).astype(on.dtype) for way in (rising, ~rising)]
+        return noise.next_tail(mean, tail), on + more[0], off + more[1]
 
     zero = jnp.zeros_like(u)
     start = (jax.tree.map(jnp.asarray, struck.odds.tail()), zero, zero)

@@ -198,7 +198,8 @@ def slots(
         time = slot_time(k, total, begin, stop)
         fires = (count > k) & (time - last > model.refractory_s)
         first = jnp.where(fires & (passed == 0), k, first)
-        return passed + fires, first, jnp.where(fires, k, final), jnp.where(fires, time, last)
+        passed = passed + fires.astype(passed.dtype)
+        return passed, first, jnp.where(fires, k, final), jnp.where(fires, time, last)
 
     zero = jnp.zeros_like(count)
     start = (zero, zero, zero, last)

@@ -12,7 +12,7 @@ import pytest
 from helpers.compilation import precise
 from helpers.networks import seen, small_params
 
-from evflow import simulate_voxels, squash, unsquash
+from evflow import simulate_counts, simulate_voxels, squash, unsquash
 from evflow.camera import PARAMETERS, Camera, Summary
 from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
@@ -135,6 +135,8 @@ def test_nothing_rests_on_implicit_dtypes() -> None:
         api.generate(small_params(), jax.random.key(1), camera, code)
         simulate_voxels(jax.random.key(0), jnp.full((3, *camera.shape), 4.0), noisy,
                         frame_dt_s=1e-3)
+        simulate_counts(jax.random.key(0), jnp.full((3, *camera.shape), 4.0), noisy,
+                        frame_dt_s=1e-3, model=SensorModel(timestamps="v2e", refractory_s=1e-4))
 
 
 def test_estimate_on_leading_axes_is_each_alone() -> None:
