@@ -59,6 +59,30 @@ def number(value: Any) -> float:
         return math.nan
 
 
+def pair(values: Any) -> tuple[float, float]:
+    """An argument (low, high), as floats; NaN if it is something else."""
+    try:
+        low, high = values
+    except (TypeError, ValueError):
+        return math.nan, math.nan
+    return number(low), number(high)
+
+
+def is_real(dtype: Any) -> bool:
+    """Whether a dtype is real (including bfloat16, and float8, which NumPy calls void) or bool."""
+    return np.dtype(dtype).kind == "b" or (
+        jnp.issubdtype(dtype, jnp.number) and not jnp.issubdtype(dtype, jnp.complexfloating))
+
+
+def map_on_host(name: str, values: Any) -> np.ndarray:
+    """A camera's map as a NumPy array; raises EV014 unless it holds real numbers."""
+    array = np.asarray(plain(name, values))
+    if not is_real(array.dtype):
+        raise EvflowDataError("EV014", f"{name} has dtype {array.dtype}.",
+                              "A map holds real numbers.")
+    return array
+
+
 def real(values: ArrayLike) -> Array:
     """Convert to float32; float64 is kept in JAX's x64 mode."""
     values = plain("the input", values)

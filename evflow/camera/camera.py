@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evflow.camera import file
-from evflow.camera.arguments import check_key, parameter, real_maps, shape_of_maps
+from evflow.camera.arguments import check_key, map_on_host, parameter, real_maps, shape_of_maps
 from evflow.camera.file import PARAMETERS
 from evflow.camera.prior import CameraPrior, Summary, sample_nominal
-from evflow.checks import need, plain
+from evflow.checks import need
 from evflow.errors import EvflowDataError, naming
 
 Array = jax.Array
@@ -186,7 +186,7 @@ class Camera:
                 "All four maps must be (..., H, W) of one sensor.",
             )
         for name, value in leaves.items():
-            array = np.asarray(plain(name, value))
+            array = map_on_host(name, value)
             bad = ~np.isfinite(array) | (array <= 0 if name.startswith("theta") else array < 0)
             if bad.any():
                 where = tuple(int(i) for i in np.argwhere(bad)[0])

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import Camera
-from evflow.camera.arguments import check_key, real_maps
+from evflow.camera.arguments import check_key, number, pair, real_maps
 from evflow.checks import need
 from evflow.errors import EvflowDataError
 
@@ -53,10 +53,10 @@ def with_faults(
             no key or camera).
     """
     camera = _checked(key, camera)
-    if not (hot >= 0 and dead >= 0 and hot + dead <= 1):
-        raise EvflowDataError("EV020", f"hot={hot}, dead={dead}.",
+    if not (number(hot) >= 0 and number(dead) >= 0 and hot + dead <= 1):
+        raise EvflowDataError("EV020", f"hot={hot!r:.60}, dead={dead!r:.60}.",
                               "Give shares of the pixels, >= 0 and at most 1 together.")
-    low, high = hot_hz
+    low, high = pair(hot_hz)
     if not 0 < low <= high < np.inf:
         raise EvflowDataError("EV020", f"hot_hz={hot_hz}.", "Give (low, high) in Hz, 0 < low.")
     k_which, k_rate = jax.random.split(key)

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from evflow.camera.arguments import number, pair
 from evflow.errors import EvflowDataError
 from evflow.light.log_maps import Values
 
@@ -84,13 +85,13 @@ class CameraPrior:
                                   "Choose 'eq12', 'independent', 'mixed' or 'none'.")
         lowest = {"theta": np.nextafter(0.0, 1.0), "mismatch": 0.0, "eta": np.nextafter(0.0, 1.0)}
         for name, bound in lowest.items():
-            span = np.asarray(getattr(self, name))
-            if span.shape != (2,) or not bound <= span[0] <= span[1] < np.inf:
+            low, high = pair(getattr(self, name))
+            if not bound <= low <= high < np.inf:
                 raise EvflowDataError(
                     "EV020", f"CameraPrior({name}={getattr(self, name)}).",
                     f"Give (low, high), low <= high, {'>=' if bound == 0 else '>'} 0.")
-        if not 0 <= self.eta_spread < np.inf:
-            raise EvflowDataError("EV020", f"CameraPrior(eta_spread={self.eta_spread}).",
+        if not 0 <= number(self.eta_spread) < np.inf:
+            raise EvflowDataError("EV020", f"CameraPrior(eta_spread={self.eta_spread!r:.60}).",
                                   "A standard deviation of log eta: >= 0.")
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from evflow.camera import Camera, Summary
-from evflow.camera.arguments import real, real_maps
+from evflow.camera.arguments import is_real, real, real_maps
 from evflow.checks import plain
 from evflow.errors import EvflowDataError
 from evflow.light.log_maps import check_log
@@ -29,12 +29,6 @@ LONGEST_WINDOW_S = 10.0  # a hundred times the longest in training: more is prob
 def same_precision(values: Array, tree: Any) -> Any:
     """The tree's leaves in the precision of `values`, since the coarser one limits the result."""
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, values.dtype), tree)
-
-
-def is_real(dtype: Any) -> bool:
-    """Whether a dtype is real (including bfloat16, and float8, which NumPy calls void) or bool."""
-    return np.dtype(dtype).kind == "b" or (
-        jnp.issubdtype(dtype, jnp.number) and not jnp.issubdtype(dtype, jnp.complexfloating))
 
 
 def check_finite(name: str, values: ArrayLike) -> None:

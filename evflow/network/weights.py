@@ -135,21 +135,44 @@ def save_weights(
 
     Raises:
         EvflowDataError: EV007 (NaN), EV013 (exists), EV019 (cannot be written), EV020 (another
-            extension, with which it could not be read again).
+            extension, with which it could not be read again; params that are not nested dicts of
+            arrays, or a card that JSON cannot hold).
     """
     if Path(path).suffix != ".safetensors":
         raise EvflowDataError("EV020", f"{path} does not end in .safetensors.",
                               f"Name it {Path(path).with_suffix('.safetensors')}.")
-    leaves = jax.tree_util.tree_leaves_with_path(params)
-    arrays = {"/".join(str(k.key) for k in keys): np.asarray(leaf, np.float32)
-              for keys, leaf in leaves}
+    arrays = _named(params)
     if lost := [name for name, array in arrays.items() if not np.isfinite(array).all()]:
         raise EvflowDataError("EV007", f"{lost[0]} has NaN or infinite values.",
                               "A training that diverged? Save an earlier state.")
+    need(card, dict, "card", "Give a dict of what is to be known, {} for nothing.")
     card = card | {DIGEST: tensors.digest(arrays)}
-    data = save(arrays, metadata={"card": json.dumps(card, sort_keys=True)})
+    try:
+        text = json.dumps(card, sort_keys=True)
+    except (TypeError, ValueError) as e:
+        raise EvflowDataError("EV020", f"the card cannot be written as JSON ({e}).",
+                              "Give numbers, text, lists and dicts.") from e
+    data = save(arrays, metadata={"card": text})
     atomic_text(path, data, overwrite=overwrite)
     return Path(path)
+
+
+def _named(params: Params) -> tensors.Arrays:
+    """The arrays as float32 by their flat names; raises EV020."""
+    fix = "Give nested dicts of arrays, as load_weights returns them."
+    need(params, dict, "params", fix)
+    arrays = {}
+    for keys, leaf in jax.tree_util.tree_leaves_with_path(params):
+        try:
+            arrays["/".join(str(k.key) for k in keys)] = np.asarray(leaf, np.float32)
+        except (AttributeError, TypeError, ValueError) as e:
+            where = jax.tree_util.keystr(keys)
+            raise EvflowDataError(
+                "EV020", f"params{where}, of type {type(leaf).__name__}, is no array of numbers in "
+                "nested dicts.", fix) from e
+    if not arrays:
+        raise EvflowDataError("EV020", "params hold no array.", fix)
+    return arrays
 
 
 def model_card(name_or_path: str | os.PathLike = "default") -> dict[str, Any]:

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 from numpy.typing import ArrayLike
 
+from evflow.camera.arguments import number
 from evflow.checks import plain
 from evflow.errors import EvflowDataError
 from evflow.light.log_maps import to_dn
@@ -61,8 +62,9 @@ def _single_frames(
     shape: tuple[int, ...], full_scale: float | None,
 ) -> Iterator[tuple[np.ndarray, int]]:
     """Validated (frame, time) pairs, from single frames or blocks."""
-    if full_scale is not None and not 0 < full_scale < np.inf:
-        raise EvflowDataError("EV020", f"full_scale={full_scale}.", "Give the value of white.")
+    if full_scale is not None and not 0 < number(full_scale) < np.inf:
+        raise EvflowDataError(
+            "EV020", f"full_scale={full_scale!r:.60}.", "Give the value of white.")
     dtype, last, index, doubt, bright = None, None, 0, None, full_scale is not None
     peak = 0  # of uint16 frames
     for block, times in itertools.zip_longest(frames_iter, times_iter):

@@ -112,6 +112,12 @@ def test_thresholds_must_be_positive_but_silence_is_legal() -> None:
     assert code_of(lambda: altered("eta_on", 0.0).validate()) == ""
 
 
+@pytest.mark.parametrize("value", ["a", None, 0.1j])
+def test_maps_that_hold_no_real_numbers_are_ev014(value: Any) -> None:
+    with pytest.raises(EvflowDataError, match=r"EV014.*eta_on has dtype"):
+        altered("eta_on", np.full(SHAPE, value), None).validate()
+
+
 def test_shapes_are_checked() -> None:
     assert code_of(lambda: altered("eta_off", jnp.zeros((4, 5)), None).validate()) == "EV015"
     assert code_of(lambda: Camera.constant((4,))) == "EV002"
@@ -319,7 +325,8 @@ def test_leading_axes_are_independent_cameras() -> None:
 
 @pytest.mark.parametrize("bad", [
     {"noise": "x"}, {"theta": (0.0, 0.5)}, {"theta": (0.5, 0.1)}, {"mismatch": (-0.1, 0.1)},
-    {"eta": (0.0, 1.0)}, {"theta": 0.2}, {"eta_spread": -1.0}])
+    {"eta": (0.0, 1.0)}, {"theta": 0.2}, {"eta_spread": -1.0}, {"theta": ("a", "b")},
+    {"eta_spread": "a"}, {"eta_spread": None}])
 def test_bad_priors_are_named(bad: dict) -> None:
     with pytest.raises(EvflowDataError, match="EV020"):
         CameraPrior(**bad)

@@ -103,7 +103,8 @@ def test_no_fault_changes_nothing_and_one_key_gives_one_camera() -> None:
 
 @pytest.mark.parametrize("options", [
     {"hot": -0.1}, {"hot": 0.6, "dead": 0.6}, {"dead": float("nan")}, {"hot_hz": (0.0, 5.0)},
-    {"hot_hz": (9.0, 5.0)}, {"hot_hz": (5.0, float("inf"))}])
+    {"hot_hz": (9.0, 5.0)}, {"hot_hz": (5.0, float("inf"))}, {"hot": "a"}, {"hot_hz": 5.0},
+    {"hot_hz": ("a", "b")}, {"hot_hz": (1.0, 2.0, 3.0)}])
 def test_impossible_faults_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(EvflowDataError, match="EV020"):
         with_faults(KEY, Camera.constant((4, 4)), **options)

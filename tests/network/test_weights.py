@@ -92,6 +92,12 @@ def test_what_is_released_is_what_is_listed(
 def test_names_and_cards_by_which_weights_can_be_read_again(tmp_path: Path) -> None:
     with pytest.raises(EvflowDataError, match=r"EV020.*\.safetensors"):
         save_weights(tmp_path / "weights", {"a": np.zeros(3)}, {})
+    for params in ([np.zeros(3)], None, {}, {"a": [np.zeros(3)]}, {"a": "b"}):
+        with pytest.raises(EvflowDataError, match=r"EV020.*nested dicts"):
+            save_weights(tmp_path / "a.safetensors", params, {})  # type: ignore[arg-type]
+    for unwritable in ([1], None, {"seed": np.arange(3)}):
+        with pytest.raises(EvflowDataError, match=r"EV020.*card"):
+            save_weights(tmp_path / "a.safetensors", {"a": np.zeros(3)}, unwritable)  # type: ignore[arg-type]
     path = tmp_path / "a.safetensors"
     for card in ("[1]", "3", "null"):
         path.write_bytes(save({"a": np.zeros(3, np.float32)}, metadata={"card": card}))

@@ -60,6 +60,7 @@ TIMES = np.array([0, 1000, 2000])
     ({"full_scale": 99.5}, "EV020", "full_scale=99.5 with uint8 frames"),
     ({"full_scale": 1}, "EV020", "Leave it out"),
     ({"full_scale": -255}, "EV020", "Give the value of white"),
+    ({"full_scale": "a"}, "EV020", "full_scale='a'"),
     ({"frames": frames(dtype=np.int32)}, "EV003", "int32"),
     ({"frames": frames(dtype=bool)}, "EV003", "bool"),
     ({"frames": frames().astype(object)}, "EV003", "object"),
