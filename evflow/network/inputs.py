@@ -112,10 +112,16 @@ def _intensity(values: ArrayLike, shape: tuple[int, ...]) -> Array:
 
 
 def check_change(name: str, values: ArrayLike) -> None:
-    """Raise EV003 if values, changes of log intensity, exceed the change from black to white."""
+    """Raise EV003 if values, changes of log intensity, exceed the change from black to white, or
+    are whole numbers other than 0."""
     if isinstance(values, jax.core.Tracer):
         return
-    most = np.abs(np.asarray(values)).max()
+    values = np.asarray(values)
+    if values.dtype.kind in "biu" and values.any():
+        raise EvflowDataError(
+            "EV003", f"{name} has dtype {values.dtype}, but changes of log intensity are mostly "
+            "below 1.", "A difference of DN? Use evflow.delta_log_intensity.")
+    most = np.abs(values).max()
     if most > MOST_CHANGE:
         raise EvflowDataError(
             "EV003", f"{name} reaches {most:.3g} in magnitude, but black to white is 5.54.",
@@ -127,7 +133,7 @@ def _check_counts(voxels: ArrayLike) -> None:
     if isinstance(voxels, jax.core.Tracer):
         return
     given = np.asarray(voxels)
-    if (least := given.min()) <= -1 or given.sum() < 0:
+    if (least := given.min()) <= -1 or given.sum(dtype=np.float64) < 0:
         raise EvflowDataError(
             "EV003", f"the minimum of voxels is {least:.3g}, but they count events.",
             "Signed polarities in one grid, or normalised? Use evflow.voxelize.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from typing import Any
 
 import jax
@@ -123,6 +124,17 @@ def test_maps_may_be_lists_or_bytes_of_another_order(kind: str) -> None:
     other = Camera(*(m.tolist() if kind == "list" else m.astype(kind) for m in maps))
     for of in (unsquash, lambda c: api.code_from_video(small_params(), dL, c).summary):
         jax.tree.map(np.testing.assert_array_equal, of(other), of(camera))
+
+
+def test_whole_numbers_pass_where_they_can_be_right() -> None:
+    voxels, dL, _ = seen()
+    whole, still = np.rint(voxels), np.zeros(dL.shape[:2])
+    one, two = (api.estimate(small_params(), whole.astype(counts), still.astype(change))
+                for counts, change in (("uint8", "int16"), ("float16", "float32")))
+    jax.tree.map(np.testing.assert_array_equal, one, two)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # sums of half precision overflow
+        api.estimate(small_params(), np.full(voxels.shape, 2000, np.float16), still)
 
 
 def test_nothing_rests_on_implicit_dtypes() -> None:
@@ -290,6 +302,8 @@ def without_summary(params: Any) -> Any:
     ("EV003", lambda p, v, d: api.estimate(p, v, d, window_s=None)),
     ("EV020", lambda p, v, d: api.estimate(p, v, d, window_s=50_000)),
     ("EV003", lambda p, v, d: api.estimate(p, v, d + 100.0)),
+    ("EV003", lambda p, v, d: api.estimate(p, v, jnp.sign(d).astype(jnp.int32))),
+    ("EV003", lambda p, v, d: api.estimate(p, v, np.full(d.shape, -128, np.int8))),
     ("EV003", lambda p, v, d: api.estimate(p, v, d, intensity=-3.0)),
     ("EV003", lambda p, v, d: api.encode(p, v, d, summary=Camera.constant(d.shape))),
     ("EV002", lambda p, v, d: api.encode(p, v, d, summary=summary(np.ones(3)))),
