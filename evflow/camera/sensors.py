@@ -12,6 +12,7 @@ import dataclasses
 from typing import Any, Literal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from evflow.checks import require
@@ -46,10 +47,12 @@ def is_off(value: Any) -> bool:
 
 def _settle(config: Any, name: str, low: float, rule: str) -> None:
     """Turn a numeric field into a float; raises EV020 unless it is finite and at least `low`.
-    Traced numbers stay as they are."""
+    Of traced numbers, which cannot raise, such ones become NaN."""
     value = getattr(config, name)
     require(config, name, np.ndim(value) == 0, "one number; jax.vmap takes several")
     if isinstance(value, jax.core.Tracer):
+        good = jnp.isfinite(value) & (value >= low)
+        object.__setattr__(config, name, jnp.where(good, value, jnp.nan))
         return
     number = np.asarray(value).dtype.kind in "biuf"
     require(config, name, number and bool(np.isfinite(value)) and value >= low, rule)
@@ -150,7 +153,7 @@ class SensorModel(_Numbers):
     The default is v2e's noise-free pixel with true crossing times. A number that is 0 is off and
     not a leaf; all others are leaves, `voltmeter` only for that `kind`. Pass a model to jit, grad
     or vmap like any other argument. A number that is traced when a model is made counts as on;
-    where its value is 0, the result is that of 0.
+    where its value is 0, the result is that of 0, and where it is impossible, NaN.
 
     Attributes:
         kind: "v2e": all of the below; "esim": log-eps intensity, and events that come within the

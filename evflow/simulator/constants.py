@@ -54,8 +54,10 @@ class Constants:
     @staticmethod
     def of(model: SensorModel) -> Constants:
         """The constants of a model, of floats or traced numbers. Raises EV020 for invalid numbers,
-        to which a gradient step may lead."""
-        model = dataclasses.replace(model)  # validates; jit and tree.map do not
+        to which a gradient step may lead; traced ones become NaN."""
+        inner = {name: dataclasses.replace(part) for name in ("voltmeter", "photoreceptor")
+                 if (part := getattr(model, name)) is not None}
+        model = dataclasses.replace(model, **inner)  # validates; jit and tree.map do not
         on: dict[str, Any] = {
             name: None if is_off(value := getattr(model, name)) else value for name in NUMBERS}
         on |= {name: getattr(model, name) for name in CHOICES}
@@ -91,7 +93,7 @@ class Constants:
 
 def _corner(cutoff_hz: Number) -> Number:
     if isinstance(cutoff_hz, jax.core.Tracer):  # which may be 0
-        return jnp.where(cutoff_hz > 0, (2 * math.pi) * cutoff_hz, AT_ONCE)
+        return jnp.where(cutoff_hz == 0, AT_ONCE, (2 * math.pi) * cutoff_hz)
     return None if cutoff_hz is None else 2 * math.pi * cutoff_hz
 
 

@@ -52,7 +52,8 @@ def simulate_counts(
 
     Returns:
         (H, W, 2) = [ON, OFF] events, float32 (float64 where log_frames are); within jit NaN at
-        pixels whose parameters are impossible (theta <= 0, eta < 0), which else raise EV014.
+        pixels whose parameters are impossible (theta <= 0, eta < 0), and everywhere if a number of
+        the model or frame_dt_s is; they else raise EV014, EV020.
 
     Raises:
         EvflowDataError: EV002 (shape), EV003 (no logarithms, or those of another map), EV007 (NaN),
@@ -99,7 +100,7 @@ def _counts(
     times: Array, model: Constants, *, smooth: float,
 ) -> Array:
     steps, *shape = log_frames.shape
-    camera, marks = sensor.possible(camera)
+    camera, marks = sensor.possible(camera, model, dt)
     whole, state = sensor.start(key, log_frames[0], camera, model, nominal)
     frames = log_frames[1:].reshape(steps - 1, math.prod(shape))
     if smooth:  # unrounded thresholds, as rounded ones have no gradient

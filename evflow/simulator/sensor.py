@@ -111,7 +111,7 @@ class Disturbance:
     struck: Struck | None
 
 
-def possible(camera: Camera) -> tuple[Camera, Array]:
+def possible(camera: Camera, model: Constants, dt: Array) -> tuple[Camera, Array]:
     """Replace impossible parameters of a traced camera (theta <= 0, eta < 0, not finite).
 
     Within jit nothing can raise, and a pixel with a negative threshold would return numbers that
@@ -119,15 +119,17 @@ def possible(camera: Camera) -> tuple[Camera, Array]:
 
     Returns:
         The camera with valid parameters, and a factor (..., H, W) for its output: 1, or NaN where
-        parameters were impossible.
+        parameters were impossible; everywhere if a number of the model is (NaN), or dt (<= 0).
     """
     least = {"theta_on": 1e-30, "theta_off": 1e-30, "eta_on": 0.0, "eta_off": 0.0}
     maps = {name: jnp.asarray(getattr(camera, name)) for name in least}
     good = [jnp.isfinite(values) & (values >= least[name]) for name, values in maps.items()]
     allowed = good[0] & good[1] & good[2] & good[3]
+    numbers = [jnp.isfinite(number) for number in jax.tree.leaves(model)]
+    known = jnp.stack([*numbers, jnp.isfinite(dt) & (dt > 0)]).all()
     put = Camera(**{name: jnp.where(allowed, values, 1.0) for name, values in maps.items()})
     unmoved = 1.0 + 0.0 * sum(maps.values())  # through it the gradients become NaN as well
-    return put, jnp.where(allowed, 1.0, jnp.nan) * unmoved
+    return put, jnp.where(allowed & known, 1.0, jnp.nan) * unmoved
 
 
 def start(

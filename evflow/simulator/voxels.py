@@ -116,7 +116,8 @@ def simulate_voxels(
 
     Returns:
         float32 (..., H, W, 2*bins), channels [ON 0..B-1, OFF 0..B-1], in events; within jit NaN at
-        pixels whose parameters are impossible (theta <= 0, eta < 0), which else raise EV014.
+        pixels whose parameters are impossible (theta <= 0, eta < 0), and everywhere if a number of
+        the model or frame_dt_s is; they else raise EV014, EV020.
 
     Raises:
         EvflowDataError: EV002 (shape), EV003 (no logarithms, or those of another map), EV007 (NaN),
@@ -199,7 +200,7 @@ def _voxels(
     times: Array, model: Constants, *, bins: int, lead: tuple[int, ...],
 ) -> Array:
     def one(key: Array, frames: Array, camera: Camera, nominal: Array | None) -> Array:
-        camera, marks = sensor.possible(camera)
+        camera, marks = sensor.possible(camera, model, dt)
         return grid_of(key, frames, camera, nominal) * marks[..., None]
 
     def grid_of(key: Array, frames: Array, camera: Camera, nominal: Array | None) -> Array:

@@ -127,6 +127,22 @@ def test_numbers_that_no_model_has_are_refused_where_it_is_used(
         assert code_of(partial(use, bad())) == "EV020"
 
 
+@pytest.mark.parametrize(("simulation", "model"), [
+    (simulate_voxels, ALL), (simulate_counts, ALL), (simulate_voxels, VOLTMETER),
+    (simulate_voxels, SensorModel(photoreceptor=SecondOrder()))])
+def test_impossible_numbers_give_nan_where_nothing_can_be_refused(
+    simulation: Callable[..., jax.Array], model: SensorModel
+) -> None:
+    run = jax.jit(lambda m, dt: simulation(KEY, LOG[:3], CAMERA, frame_dt_s=dt, model=m))
+    assert np.isfinite(run(model, 1e-3)).all()
+    assert np.isnan(run(model, -1e-3)).all()
+    leaves, made = jax.tree.flatten(model)
+    for at in range(len(leaves)):
+        wrong = np.nan if model.kind == "voltmeter" and at in (3, 4) else -1.0  # leak of any sign
+        altered = jax.tree.unflatten(made, [*leaves[:at], wrong, *leaves[at + 1:]])
+        assert np.isnan(run(altered, 1e-3)).all()
+
+
 def test_a_traced_model_has_no_list_of_events() -> None:
     assert code_of(lambda: jax.jit(events)(ALL)) == "EV020"
     assert code_of(
