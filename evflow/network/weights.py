@@ -161,7 +161,7 @@ def _named(params: Params) -> tensors.Arrays:
     """The arrays as float32 by their flat names; raises EV020."""
     fix = "Give nested dicts of arrays, as load_weights returns them."
     need(params, dict, "params", fix)
-    arrays = {}
+    arrays: tensors.Arrays = {}
     for keys, leaf in jax.tree_util.tree_leaves_with_path(params):
         try:
             arrays["/".join(str(k.key) for k in keys)] = np.asarray(leaf, np.float32)
