@@ -12,11 +12,12 @@ import numpy as np
 from evflow.camera import Summary
 from evflow.camera.optics import Optics
 from evflow.camera.sensors import SensorModel
-from evflow.estimation import drift, maps
+from evflow.estimation import drift, maps, rested
 from evflow.estimation.extent import EVERYTHING, Extent
 from evflow.estimation.front_end import FrontEnd
 from evflow.estimation.leak import Leak, measured_leak
 from evflow.estimation.one_polarity import (
+    POLARITIES,
     no_more_than_all,
     undetermined,
     with_prior,
@@ -24,7 +25,13 @@ from evflow.estimation.one_polarity import (
 )
 from evflow.estimation.pooled import Quiet, need_shown, quiet_times
 from evflow.estimation.refine import Chunk
-from evflow.estimation.remarks import camera_notes, lost_notes, noise_notes, receptor_notes
+from evflow.estimation.remarks import (
+    camera_notes,
+    drift_notes,
+    lost_notes,
+    noise_notes,
+    receptor_notes,
+)
 from evflow.estimation.result import CameraEstimate
 from evflow.estimation.shot import Shot, at_mean_light, measured_noise, measured_shot, scatter
 from evflow.estimation.state import Advance, State, summary_so_far, windows_of
@@ -109,7 +116,10 @@ def estimate(
     quiet = quiet_times(
         _counted(windows_of(state.read), advance), summary, refined.faulty, front_end.seen_by)
     std = maps.with_unquiet_error(summary, std, quiet.share, quiet.pixel_s)
-    leak = measured_leak(quiet.waits)
+    summary, std, quiet, by_drift = without_drift(
+        state, refined.faulty, lacking, summary, std, quiet)
+    # A memory that leaks is like light that rises.
+    leak = Leak() if by_drift[0] else measured_leak(quiet.waits)
     shot = measured_shot(
         quiet.light, leak.rate_hz, scatter(quiet.maps, refined.faulty), SIGNAL_ERROR)
     sent = quiet.at_mean_light() if shot.falls else quiet.maps.copy()
@@ -129,12 +139,34 @@ def estimate(
     return CameraEstimate(
         camera, error, summary, std, (state.n_shown >= VALID_EVENTS) & ~hot, n_events, hot, dead,
         state.windows,
-        (*before, *camera_notes(stats, lacking, alone, n_events, summary, hot, dead),
+        (*before, *camera_notes(stats, lacking, alone, n_events, summary, hot, dead, by_drift),
          *receptor_notes(front_end.found, refined.optics, summary, std), *lost_notes(lost),
-         *noise_notes(shot), *after,
+         *noise_notes(shot), *drift_notes(quiet.drift, by_drift), *after,
          *extent.notes(), *drift.notes(thirds)),
         tuple(f"theta_{name}" for name in lacking),
         **_measured(front_end, refined.optics, leak, shot), extent=extent, thirds=thirds)
+
+
+def without_drift(
+    state: State, faulty: Array, lacking: Sequence[str], summary: Summary, std: Summary,
+    quiet: Quiet,
+) -> tuple[Summary, Summary, Quiet, Array]:
+    """Noise of rested pixels, where the light of the scene drifts and they show less of it; and
+    (2,) Hz, how much less, 0 where nothing was changed. lacking: polarities without thresholds."""
+    theta, eta, error = (np.array([float(getattr(s, f"{name}_{p}")) for p in POLARITIES])
+                         for s, name in ((summary, "theta"), (summary, "eta"), (std, "eta")))
+    theta[[p in lacking for p in POLARITIES]] = rested.LEAST_THETA
+    due = quiet.drift / theta
+    if not rested.worth_a_look(eta, due):
+        return summary, std, quiet, np.zeros(2)
+    at_rest = quiet_times(windows_of(state.read), summary, faulty, state.front_end.seen_by,
+                          rested.Rested(faulty.shape, rested.REACH * theta))
+    noise = rested.noise_at_rest(eta, due, *at_rest.maps[:, :, ~faulty].sum(2).T)
+    if not noise.less.any():
+        return summary, std, quiet, np.zeros(2)
+    hz, error = np.where(noise.less, [noise.hz, noise.std_hz], [eta, error])
+    return (_with_rates(summary, hz), _with_rates(std, error),
+            quiet.replaced(at_rest, noise.less), eta - hz)
 
 
 def _at_mean_light(
@@ -143,9 +175,13 @@ def _at_mean_light(
     """The summary with noise rates at the recording's mean light."""
     eta, error = (np.array([float(s.eta_on), float(s.eta_off)]) for s in (summary, std))
     eta, error = at_mean_light(eta, error, quiet.light, leak.rate_hz, quiet.factor, SIGNAL_ERROR)
-    names = ("eta_on", "eta_off")
-    return (dataclasses.replace(summary, **dict(zip(names, map(jnp.float32, eta), strict=True))),
-            dataclasses.replace(std, **dict(zip(names, map(jnp.float32, error), strict=True))))
+    return _with_rates(summary, eta), _with_rates(std, error)
+
+
+def _with_rates(summary: Summary, eta: Array) -> Summary:
+    """The summary, or its std, with these noise rates (2,)."""
+    on, off = map(jnp.float32, eta)
+    return dataclasses.replace(summary, eta_on=on, eta_off=off)
 
 
 def _measured(

@@ -17,6 +17,7 @@ from evflow.errors import EvflowDataError
 from evflow.estimation.intervals import QuietWaits, Waits
 from evflow.estimation.pixel_noise import calm, quiet_time
 from evflow.estimation.refine.stretches import BAND, LARGE
+from evflow.estimation.rested import Drift, Rested
 from evflow.estimation.shot import LIGHTS, by_light
 from evflow.light.log_maps import (
     lin_log_inverse,
@@ -131,7 +132,8 @@ class Quiet:
     maps: (2, 2, H, W), ON and OFF, events and seconds; light: the same by the pixels' light, of
     `by_light`; waits: for an event; falling: (2, H, W) seconds, each weighted by `noise_factor` of
     the pixel's light then; factor: the mean of `noise_factor` over pixels and time; share: (2,) of
-    pixel_s, the seconds of all pixels but hot ones."""
+    pixel_s, the seconds of all pixels but hot ones; drift: (2,) log units per second by which the
+    light of the scene rises and falls."""
 
     maps: np.ndarray
     light: np.ndarray
@@ -140,28 +142,44 @@ class Quiet:
     factor: float
     share: np.ndarray
     pixel_s: float
+    drift: np.ndarray
 
     def at_mean_light(self) -> np.ndarray:
         """The maps for noise that falls with light: seconds are replaced by those in which as much
         noise would come at the mean light."""
         return np.stack([self.maps[:, 0], self.falling / self.factor], 1)
 
+    def replaced(self, other: Quiet, which: np.ndarray) -> Quiet:
+        """This, with events and seconds of the other for the polarities `which` (2,) bool."""
+        of_which = which[:, None, None]
+        return dataclasses.replace(
+            self, maps=np.where(of_which[..., None], other.maps, self.maps),
+            light=np.where(of_which, other.light, self.light),
+            falling=np.where(of_which, other.falling, self.falling))
+
 
 def quiet_times(
-    windows: Iterable[Window], summary: Summary, hot: np.ndarray, seen_by: Photoreceptor
+    windows: Iterable[Window], summary: Summary, hot: np.ndarray, seen_by: Photoreceptor,
+    rested: Rested | None = None,
 ) -> Quiet:
-    """The `quiet_time` of all windows."""
+    """The `quiet_time` of all windows; of pixels that have rested, if `rested` is given."""
     noise = np.array([summary.eta_on, summary.eta_off])
     total = np.zeros((2, 2, *hot.shape))
     light, waits = np.zeros((2, 3, LIGHTS)), QuietWaits(hot.shape)
     falling, factor, seconds = np.zeros((2, *hot.shape)), 0.0, 1e-9
+    drift = Drift()
     for window in windows:
         frames = window.frame0, window.frame1
         seen = [_light(f, seen_by) for f in frames]
-        _, change = _mean_and_change(*seen)
-        place = (window.events.count_map(), np.asarray(change), exposed(*frames), hot,
-                 window.window_s, noise)
+        mean, change = map(np.asarray, _mean_and_change(*seen))
+        counts, visible = window.events.count_map(), exposed(*frames)
+        common = drift.add(change, visible & ~hot, window.window_s)
+        own = change - common if rested else change
+        place = (counts, own, visible, hot, window.window_s, noise)
         found = quiet_time(*place)
+        if rested:
+            light_at = np.stack([mean - 0.5 * change, mean + 0.5 * change])
+            found *= rested.add((window.t0_us, window.t1_us), light_at, counts)[:, None]
         total += found
         # As `seen_frames`: darker by one factor where light is added.
         shown = 255.0 / (255.0 + max(seen_by.offset_dn, 0.0))
@@ -174,4 +192,5 @@ def quiet_times(
         waits.add(window.events, (window.t0_us, window.t1_us), calm(*place))
     pixel_s = seconds * max(1, int((~hot).sum()))
     share = total[:, 1][:, ~hot].sum(1) / pixel_s
-    return Quiet(total, light, waits.table(), falling, factor / seconds, share, pixel_s)
+    return Quiet(total, light, waits.table(), falling, factor / seconds, share, pixel_s,
+                 drift.per_second)

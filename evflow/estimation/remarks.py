@@ -23,20 +23,22 @@ LOGARITHMIC = Note(
 
 def camera_notes(
     stats: Stats, undetermined: tuple[str, ...], alone: tuple[str, ...], n_events: np.ndarray,
-    summary: Summary, hot: np.ndarray, dead: np.ndarray,
+    summary: Summary, hot: np.ndarray, dead: np.ndarray, by_drift: np.ndarray,
 ) -> list[Note]:
     """Notes on pixels and thresholds. stats: without the events of hot pixels; undetermined, alone:
-    polarities without a threshold, and measured by themselves."""
+    polarities without a threshold, and measured by themselves; by_drift: of `drift_notes`."""
     found = _faulty(
         "hot", hot, "they fire while nothing moves and were left out of the refinement.")
     found += dead_notes(dead)
     low, high = PRESETS["default"].prior.theta
-    for name, events in (("on", stats.events_on), ("off", stats.events_off)):
+    for name, events, drift in (("on", stats.events_on, by_drift[0]),
+                                ("off", stats.events_off, by_drift[1])):
         theta = float(getattr(summary, f"theta_{name}"))
         if name in undetermined:
             found.append(Note(
                 f"theta_{name}.undetermined", f"only {int(events)} {name.upper()} events, no more "
-                f"than noise: theta_{name} is undetermined and has the prior's value"
+                f"than noise{' and the drift of the light' if drift else ''}: theta_{name} is "
+                "undetermined and has the prior's value"
                 + "".join(f"; theta_{other} was measured by itself, less precisely"
                           for other in alone) + "."))
         elif float(events) < FEW_EVENTS:
@@ -119,3 +121,16 @@ def lost_notes(lost: Lost | None) -> list[Note]:
 def noise_notes(shot: Shot) -> list[Note]:
     return [Note("noise.even", "the noise does not fall with light as v2e's shot noise does: "
                  "simulations have the same noise at any light.")] if shot.even else []
+
+
+def drift_notes(per_second: np.ndarray, by_drift: np.ndarray) -> list[Note]:
+    """per_second: (2,) log units by which the light rises, and falls; by_drift: (2,) Hz of ON and
+    OFF events that are not counted as noise therefore, 0 where nothing was changed."""
+    return [Note(
+        "noise.drift", f"the light of the whole scene {moves} by {change:.1%} a second on average "
+        f"(a lamp, a cloud?): {hz:.2g} Hz per pixel of {name.upper()} events come from that and "
+        f"are not counted in eta_{name}, which is of pixels whose light had hardly changed since "
+        "their last event" + ("; a leak, which looks the same, is not measured." if name == "on"
+                              else "."))
+        for name, moves, change, hz in zip(("on", "off"), ("rises", "falls"), per_second, by_drift,
+                                           strict=True) if hz]
