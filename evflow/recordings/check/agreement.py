@@ -39,6 +39,10 @@ PARTS, IN_PART = 4, 0.4  # of the steps; least r of the best one
 LOST, SHOWN = 0.25, 0.25  # share of that r below which another part disagrees (the least in 28
 # sound recordings is .4), if its frames change by at least that share
 LEAST_OFFSET_US = 10_000
+ALIKE, ONE_SIDED = 0.8, 0.2  # least cosine of change and net events of the whole image, and least
+# share of net events among all, where nothing but the light changes
+USABLE = (0.03, 1.0)  # log units per event: thresholds of such light
+STEADY = 0.1  # log units by which the change of cells then differs, rms: noise of frames
 
 
 def agreement(recording: Recording) -> list[Finding]:
@@ -89,13 +93,26 @@ def _judged(recording: Recording, steps: Steps) -> list[Finding]:
             f"the events (r {here:+.2f}, {best:+.2f} where they agree best).",
             f"Pass --frames-offset-ms {offset / 1e3:.1f}, in addition to what was passed, or "
             "--frames-offset-ms auto.")]
-    if max(best, abs(flips[flip])) < UNRELATED and steps.enough():
+    if max(best, abs(flips[flip])) < UNRELATED and steps.enough() and not _by_light(steps):
         return [Finding(
             "EV034", "error", f"events and frames are unrelated ({over}; no shift, flip or "
             "polarity improves it).",
             "Are they from one camera and one time? Are coordinates transposed, or is the time "
             "unit wrong (--time-unit)? Nothing can be measured from them.")]
     return []
+
+
+def _by_light(steps: Steps) -> bool:
+    """Whether the light of the whole scene changes, events follow, and nothing else happens. Sums
+    so far are compared: pixels of one threshold, as of a simulation, fire together now and then."""
+    change, net, *_, count = steps.sums(np.zeros(1, np.int64))[..., 0].T
+    light, sent = np.cumsum(change), np.cumsum(net)
+    both, power = float((light * sent).sum()), float((sent**2).sum())
+    theta = both / max(power, 1.0)
+    cells = steps.changes[""]
+    unlike = np.sqrt(np.nanmean((cells - np.nanmean(cells, 1, keepdims=True)) ** 2)) / steps.cell**2
+    return bool(both > ALIKE * np.sqrt((light**2).sum() * power) and USABLE[0] < theta < USABLE[1]
+                and np.abs(net).sum() > ONE_SIDED * count.sum() and unlike < STEADY)
 
 
 def _mirrored(flip: str, here: float, best: float) -> Finding:

@@ -203,3 +203,17 @@ def test_a_change_of_exposure_in_a_scene_at_rest_is_no_step_of_its_light(rests: 
     still = dataclasses.replace(filmed(rests, 0.7), events=noise)
     assert not {"EV021", "EV024", "EV029"} & codes_of(still)
     assert frames_offset(still) == 0
+
+
+def test_a_scene_of_which_only_the_light_changes_is_not_unrelated() -> None:
+    """All cells change alike, so that none of them tells events of the light from those of chance;
+    frames that become darker instead do."""
+    rng, shape, times = np.random.default_rng(2), (128, 160), 40_000 * np.arange(26)
+    light = np.exp(0.3e-6 * times)[:, None, None]
+    dn = np.broadcast_to(rng.uniform(30.0, 120.0, shape) * light, (26, *shape))
+    camera = Camera.constant(shape, 0.05, 0.05, 0.2, 0.2)
+    events = simulate(jax.random.key(1), dn.astype(np.float32), times, camera)
+    rising = filmed(Recording(events, dn.astype(np.float32), times), 1.0)
+    assert "EV034" not in codes_of(rising)
+    falling = dataclasses.replace(rising, frames=rising.frames[::-1].copy())
+    assert "EV034" in codes_of(falling)
