@@ -22,7 +22,7 @@ LEAST_THETA = 0.1  # log units: that of usable cameras, where the threshold is u
 STEADY = 0.05  # log units: change of a pixel in a window, beyond which something moves there
 BLOCK_S = 1.0  # the light's ups and downs are added over such times: noise of frames averages out
 LEAST_SHARE = 0.15  # of the noise: fewer events by drift are not looked for
-LESS, UNLIKE = 2.0, 0.05  # standard deviations by which rested pixels must send fewer events, and
+LESS, UNLIKE = 3.0, 0.05  # standard deviations by which rested pixels must send fewer events, and
 # the error, relative, of what others lead to expect
 # Their lack of events, over drift per threshold: .2 to 1.3 in simulations. It depends on where
 # memories began, on noise that resets them, and on what was not taken for noise.
