@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Literal
 
 from evflow.errors import EvflowDataError
+from evflow.files.atomic import need_no_folder
 
 Format = Literal["auto", "dsec", "e2vid", "event_utils", "evreal", "npz", "aedat4", "aedat2"]
 
 FILES = frozenset((  # extensions that folders do not have
     ".npz", ".npy", ".json", ".html", ".htm", ".png", ".jpg", ".pdf", ".svg", ".txt", ".csv",
-    ".md", ".zip", ".h5", ".hdf5", ".aedat4", ".aedat", ".mp4", ".gif", ".py", ".yaml"))
+    ".md", ".zip", ".h5", ".hdf5", ".aedat4", ".aedat", ".mp4", ".gif", ".py", ".yaml",
+    ".safetensors"))
 
 
 def named(format: Format, out: Path) -> str | None:
@@ -57,14 +59,17 @@ def _part_of(path: Path, source: Path) -> bool:
 
 
 def need_absent(path: Path, overwrite: bool, *sources: Path | None) -> None:
-    """Raise EV013 before long work if the output exists; EV020 if it is one of the sources, or a
-    file in a source folder: what is read may be the only copy."""
+    """Raise EV013 before long work if the output exists, or is a folder with the name of a file;
+    EV020 if it is one of the sources, or a file in a source folder: what is read may be the only
+    copy."""
     if not path.exists():
         return
     if any(source is not None and source.exists() and _part_of(path, source)
            for source in sources):
         raise EvflowDataError("EV020", f"the output {path} is the input, or lies in it.",
                               "Choose another: no command replaces its input.")
+    if path.suffix.lower() in FILES:
+        need_no_folder(path)
     if not overwrite:
         raise EvflowDataError(
             "EV013", f"{path} exists.", "Pass --overwrite if this command made that folder; "

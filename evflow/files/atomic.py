@@ -49,12 +49,20 @@ def atomic_write(path: str | os.PathLike, *, overwrite: bool = False) -> Iterato
     """Yield a temporary path beside `path`; rename it into place only if the block succeeds.
 
     Raises EV013 if `path` exists before or after the block and `overwrite` is false, or if it is
-    not a regular file; EV019 if the disk is full or the path cannot be written. The temporary file
-    is removed on any failure including Ctrl-C; that of a killed process by the next write of
-    `path`.
+    a folder or not a regular file; EV019 if the disk is full or the path cannot be written. The
+    temporary file is removed on any failure including Ctrl-C; that of a killed process by the next
+    write of `path`.
     """
+    need_no_folder(path)
     with written_aside(path, _move, overwrite=overwrite) as temporary:
         yield temporary
+
+
+def need_no_folder(path: str | os.PathLike) -> None:
+    """Raise EV013 where a file is to be written but a folder lies: it is not replaced by a file."""
+    if os.path.isdir(path):
+        raise EvflowDataError("EV013", f"{path} is a folder, and a file of that name would be "
+                              "written.", "Choose another output.", where=path)
 
 
 def atomic_text(path: str | os.PathLike, data: str | bytes, *, overwrite: bool = False) -> None:

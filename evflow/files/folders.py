@@ -9,7 +9,13 @@ from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 from evflow.errors import EvflowDataError
-from evflow.files.atomic import aside, atomic_write, clear_leftovers, written_aside
+from evflow.files.atomic import (
+    aside,
+    atomic_write,
+    clear_leftovers,
+    need_no_folder,
+    written_aside,
+)
 from evflow.files.locks import lock
 from evflow.files.moves import move_new, swap_folders
 from evflow.process.signals import uninterrupted
@@ -58,10 +64,12 @@ def staged(folder: str | os.PathLike, *, names: Sequence[str], overwrite: bool =
     names: all files that the block may write. Those already in `folder` are removed, so that no
     stale file lies beside the new ones; other files stay. Of several processes each moves its files
     while the others wait.
-    Raises EV013 if one of them exists and `overwrite` is false, EV019 if the folder cannot be
-    written.
+    Raises EV013 if one of them is a folder, or exists and `overwrite` is false; EV019 if the folder
+    cannot be written.
     """
     folder = Path(folder)
+    for name in names:
+        need_no_folder(folder / name)
     if not overwrite and (old := [name for name in names if (folder / name).exists()]):
         raise EvflowDataError("EV013", f"{folder} holds {', '.join(old)}.",
                               "Pass --overwrite (overwrite=True).", where=folder)

@@ -17,7 +17,7 @@ from PIL import Image
 
 from evflow.errors import EvflowDataError
 from evflow.estimation.pipeline import Progress
-from evflow.files.atomic import atomic_write
+from evflow.files.atomic import atomic_write, need_no_folder
 from evflow.recordings.windows import need_few_windows
 from evflow.report.caption import captioned
 from evflow.report.page import short
@@ -62,10 +62,11 @@ class Film:
         return 1e6 / (self.fps * self.slow)
 
     def check_target(self, path: Path, *, overwrite: bool) -> None:
-        """EV013 where it exists, EV020 where it is neither .mp4, .gif nor .png."""
+        """EV013 where it exists or is a folder, EV020 where it is neither .mp4, .gif nor .png."""
         if path.suffix.lower() not in SUFFIXES:
             raise EvflowDataError("EV020", f"{path.name} does not end in {', '.join(SUFFIXES)}.",
                                   "The extension selects the format.")
+        need_no_folder(path)
         if path.exists() and not overwrite:
             raise EvflowDataError("EV013", f"{path} exists.", "Pass --overwrite.")
 

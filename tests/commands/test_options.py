@@ -91,6 +91,22 @@ def test_contradictions_and_wrong_names_are_refused(
     assert sorted(folder.iterdir()) == before
 
 
+@pytest.mark.parametrize("line", [
+    "simulate frames.npy --fps 9 -o {}.h5", "simulate frames.npy --fps 9 -o e.h5 --preview {}.mp4",
+    "convert flight.npz {}.npz", "voxel flight.npz -o {}.npz", "render flight.npz -o {}.mp4"])
+@pytest.mark.parametrize("also", ["", " --overwrite"])
+def test_a_folder_in_the_place_of_a_file_is_refused_before_anything_is_read(
+    line: str, also: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for kind in (".h5", ".npz", ".mp4"):
+        (folder / f"taken{kind}").mkdir()
+    for source in ("frames.npy", "flight.npz"):
+        (folder / source).write_bytes(b"unreadable")
+    code, said = run(line.format("taken") + also, capsys)
+    assert (code, said[:5]) == (1, "EV013")
+    assert "is a folder" in said
+
+
 def test_a_format_of_the_same_container_or_of_a_name_without_meaning_passes() -> None:
     assert named("event_utils", Path("a.hdf5")) == "event_utils"
     assert named("dsec", Path("a.data")) == "dsec"

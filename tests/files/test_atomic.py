@@ -65,6 +65,19 @@ def test_through_a_link_its_target_is_written_and_the_link_stays(tmp_path: Path)
     assert "leads to itself" in str(refusal(loop, overwrite=True))
 
 
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_folder_is_never_replaced_by_a_file(tmp_path: Path, overwrite: bool) -> None:
+    (tmp_path / "out.txt").mkdir()
+    error = refusal(tmp_path / "out.txt", overwrite=overwrite)
+    assert error.code == "EV013"
+    assert "is a folder" in str(error)
+    assert "--overwrite" not in str(error)
+    with pytest.raises(EvflowDataError, match=r"EV013.*is a folder"), staged(
+            tmp_path, names=["out.txt"], overwrite=overwrite):
+        pytest.fail("work began")
+    assert os.listdir(tmp_path) == ["out.txt"]
+
+
 def test_overwrites_only_when_asked(tmp_path: Path) -> None:
     path = tmp_path / "out.txt"
     write(path, "old")
@@ -268,14 +281,6 @@ def test_what_a_killed_run_left_goes_with_the_next(tmp_path: Path, name: str) ->
     assert left < set(os.listdir(tmp_path))
     write(path, "new")
     assert set(os.listdir(tmp_path)) == {name, "other.txt", old, *elsewhere}
-
-
-def test_a_folder_is_never_replaced(tmp_path: Path) -> None:
-    (tmp_path / "out").mkdir()
-    assert refusal(tmp_path / "out").code == "EV013"
-    assert refusal(tmp_path / "out", overwrite=True).code == "EV019"
-    assert (tmp_path / "out").is_dir()
-    assert os.listdir(tmp_path) == ["out"]
 
 
 def test_devices_are_never_replaced() -> None:
