@@ -40,7 +40,7 @@ NOTES: dict[str, str] = {
     "frames.fast": "motion too fast to interpolate well",
     "frames.flipped": "frames were mirrored",
     "frames.flow": "the motion between frames was not found",
-    "frames.gaps": "image numbers are missing",
+    "frames.gaps": "image numbers are missing, or are times",
     "frames.hdr": "an HDR video was tone-mapped",
     "frames.laid": "frames were cropped or scaled",
     "frames.late": "frames with decreasing times were left out or sorted",

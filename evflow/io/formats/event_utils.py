@@ -23,7 +23,7 @@ from evflow.io.decode.hdf5_search import images_beside
 from evflow.io.decode.stream import gather
 from evflow.io.hints import Hints
 from evflow.io.images.exposures import KEY, Stamps, stated_by
-from evflow.io.images.folder import natural
+from evflow.io.images.numbers import natural
 from evflow.io.images.streams import ImageStream
 from evflow.io.writer import FLUSH, SECONDS_US
 from evflow.notes import Note

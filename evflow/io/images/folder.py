@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import re
 import struct
 import zipfile
 import zlib
@@ -19,6 +18,7 @@ from evflow.files.limits import check_expansion, read_whole
 from evflow.files.regular import is_there
 from evflow.io.images import exr
 from evflow.io.images.frames import FrameHints, Image
+from evflow.io.images.numbers import KEEP, gaps, natural, running, unit_of
 from evflow.io.images.pictures import claimed_bytes
 from evflow.io.images.times import read_times
 from evflow.notes import Note
@@ -60,8 +60,8 @@ def open_folder(root: Path, hints: FrameHints) -> ImageFolder:
     if hints.fps is not None:
         _check_once(files)
         times = np.array([hints.at_rate(i) for i in range(len(files))], np.int64)
-        return ImageFolder(tuple(files), times, made + _gaps(files))
-    source = _times_file(root, folder, hints)
+        return ImageFolder(tuple(files), times, made + gaps(files, hints))
+    source = _times_file(root, folder, files, hints)
     by_name = {file.name: file for file in files}
     us, notes, exposure_us, names = read_times(source, hints.time_unit, by_name)
     if not names:
@@ -93,24 +93,6 @@ def _check_once(files: list[Path]) -> None:
                 where=file.parent)
 
 
-def _gaps(files: list[Path]) -> tuple[Note, ...]:
-    """A note if the running number in the file names skips values."""
-    parts = [natural(file.name)[0] for file in files]
-    alike = len({len(part) for part in parts}) == 1
-    varying = [i for i, same in enumerate(zip(*parts, strict=False)) if len(set(same)) > 1]
-    if not alike or len(varying) != 1 or not (at := varying[0]) % 2:
-        return ()
-    numbers = np.array([part[at] for part in parts], np.float64)
-    steps = np.diff(numbers)
-    jumps = np.flatnonzero(steps > np.median(steps))
-    if not len(jumps):
-        return ()
-    many = f", and in {len(jumps) - 1} more places" if len(jumps) > 1 else ""
-    return (Note("frames.gaps", f"image numbers jump from {files[jumps[0]].name} to "
-                 f"{files[jumps[0] + 1].name}{many}: are images missing? They are assumed to be "
-                 "evenly spaced; --timestamps keeps gaps in time."),)
-
-
 def list_images(folder: Path) -> list[Path]:
     """The image files of a folder in natural order (img2 before img10), without hidden ones."""
     try:
@@ -132,12 +114,6 @@ def unread_images(root: Path) -> tuple[Note, ...]:
                          "images.txt names their times: --frames "
                          f"{quote(str(folder))} --timestamps {quote(str(times))}"),)
     return ()
-
-
-def natural(name: str) -> tuple[list[str | int], str]:
-    """A sort key that compares digits in names as numbers."""
-    parts = re.split(r"([0-9]+)", name.lower())
-    return [int(p) if i % 2 else p for i, p in enumerate(parts)], name
 
 
 def decode(file: Path | zipfile.Path) -> np.ndarray:
@@ -238,7 +214,7 @@ def _made(folder: Path) -> tuple[Note, ...]:
     return (Note("frames.made", first),) if MADE in first else ()
 
 
-def _times_file(root: Path, folder: Path, hints: FrameHints) -> Path:
+def _times_file(root: Path, folder: Path, files: list[Path], hints: FrameHints) -> Path:
     if hints.timestamps is not None:
         return Path(hints.timestamps)
     found = [p for place in dict.fromkeys((folder, root)) for name in TIMES
@@ -246,6 +222,8 @@ def _times_file(root: Path, folder: Path, hints: FrameHints) -> Path:
     if found:
         return found[0]
     near = [str(p) for name in TIMES if (p := folder.parent / name).is_file()]
+    unit = unit_of(running(files))
+    named = f" Their names look like times in {unit}: {KEEP}." if unit else ""
     raise EvflowDataError(
         "EV020", f"{folder} has images but no file with their times ({', '.join(TIMES[:3])}, ...).",
-        f"Pass --fps, or --timestamps {near[0] if near else 'FILE'}.", where=folder)
+        f"Pass --fps, or --timestamps {near[0] if near else 'FILE'}.{named}", where=folder)

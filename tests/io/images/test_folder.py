@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from evflow import Events, Recording, write_events
 from evflow.io.images.exposures import Stamps
-from evflow.io.images.folder import natural
+from evflow.io.images.numbers import natural
 from evflow.io.images.times import to_us
 from evflow.io.source import open_frames
 

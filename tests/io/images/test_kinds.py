@@ -68,6 +68,27 @@ def test_missing_numbers_are_told(tmp_path: Path, numbers: list[int], said: str)
     assert all(said in text for text in told)
 
 
+@pytest.mark.parametrize(("first", "apart", "jitter", "fps", "lost", "said"), [
+    (1403636579763555584, 50_000_000, 0, 20, 0, ""),  # ns, which float64 does not hold
+    (1403636579763555584, 50_000_000, 20_000, 20, 0, ""),
+    (0, 50_000, 20, 20, 0, ""),
+    (1403636579763555584, 50_000_000, 20_000, 20, 1, "in ns, 20 frames/s; those of --fps 20 are"),
+    (1403636579763555584, 50_000_000, 0, 25, 0, "ns, 20 frames/s; those of --fps 25 are")])
+def test_numbers_that_are_times(
+    tmp_path: Path, first: int, apart: int, jitter: int, fps: float, lost: int, said: str
+) -> None:
+    rng = np.random.default_rng(0)
+    for i, frame in enumerate(FRAMES):
+        time = first + apart * (i + lost * (i > 2)) + int(rng.integers(-jitter, jitter + 1))
+        cv2.imwrite(str(tmp_path / f"{time + jitter}.png"), frame)
+    told = [note.text for note in open_frames(tmp_path, fps=fps).notes
+            if note.code == "frames.gaps"]
+    assert len(told) == bool(said)
+    assert all(said in text for text in told)
+    with pytest.raises(EvflowDataError, match=r"EV020.*names look like times in [nu]s"):
+        open_frames(tmp_path)
+
+
 def test_names_of_several_numbers_have_no_gaps(tmp_path: Path) -> None:
     for i, frame in enumerate(FRAMES):
         cv2.imwrite(str(tmp_path / f"{i // 3}_{7 * i % 3}.png"), frame)
