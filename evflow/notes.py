@@ -63,7 +63,7 @@ NOTES: dict[str, str] = {
     "frames.swept": "the frames are views of a sensor moved over one picture",
     "frames.unit": "the unit of the frame times was inferred",
     "frames.unused": "frames were left out",
-    "frames.white": "the radiance that counts as white",
+    "frames.white": "the value that counts as white",
     "levels.clipped": "saturated or black frames hide a level of light",
     "levels.dark": "which logarithm dark levels of light have is open",
     "levels.few": "all light steps have the same size",

@@ -18,6 +18,7 @@ Size = tuple[int, int]
 PIXEL, PIXEL_OF_FLOATS = 8, 16  # maximum bytes: four channels
 # Some decoders take `#` directly after a number for a comment: blanks must come first.
 NETPBM = re.compile(rb"P[1-6](?:\s+|#[^\n]*\n)+(\d{1,9})\s(?:\s+|#[^\n]*\n)*(\d{1,9})\s")
+MAXVAL = re.compile(NETPBM.pattern + rb"(?:\s+|#[^\n]*\n)*(\d{1,5})\s")
 PFM = re.compile(rb"P[Ff]\s+(\d{1,9})\s+(\d{1,9})\s")
 RADIANCE = re.compile(rb"\n[-+]Y (\d{1,9}) [-+]X (\d{1,9})\n")
 TIFF_SIZE = (256, 257)  # tags ImageWidth, ImageLength
@@ -41,6 +42,15 @@ def claimed_bytes(data: bytes) -> int | None:
     size = claimed_size(data)
     pixel = PIXEL_OF_FLOATS if data.startswith(FLOATS) else PIXEL
     return None if size is None else size[0] * size[1] * pixel
+
+
+def stated_white(data: bytes) -> int | None:
+    """What a PGM or PPM names as its largest value, as OpenCV returns it: of text, 8 bits are
+    scaled to 255. None for other formats."""
+    match = MAXVAL.match(data) if data.startswith((b"P2", b"P3", b"P5", b"P6")) else None
+    if match is None:
+        return None
+    return 255 if data[:2] in (b"P2", b"P3") and int(match[3]) <= 255 else int(match[3])
 
 
 def _png(data: bytes) -> Size:

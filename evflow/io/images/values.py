@@ -6,11 +6,15 @@ The response is undone before colours are summed: a pixel adds light, not code v
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 
 from evflow.errors import EvflowDataError
+from evflow.files.regular import need_regular
+from evflow.io.images.pictures import stated_white
 from evflow.light.colour import luma
 from evflow.light.ranges import Meaning, likely_white, meaning
 from evflow.light.response import linear_light
@@ -18,6 +22,8 @@ from evflow.notes import Note
 
 WHITE = {"u1": 255.0, "u2": 65535.0, "f4": 255.0}  # default DN of a saturated pixel
 WHITE_PERCENT = 99.0
+USUAL = {int(WHITE["u1"]), int(WHITE["u2"])}
+NETPBM, HEAD = (".pgm", ".ppm"), 1 << 12  # bytes in which these name their white
 BACKGROUNDS = {"black": 0.0, "white": 1.0}
 
 
@@ -61,6 +67,26 @@ def white_of_radiance(pixels: np.ndarray, full_scale: float | None) -> tuple[flo
     return white, Note(
         "frames.white", f"radiance of {white:.4g} is white: {WHITE_PERCENT:g} % of the first image "
         "is darker; brighter values are treated as white; --full-scale sets another value.")
+
+
+def white_of_files(files: Sequence[Path]) -> int | None:
+    """The white that PGM or PPM files name, if it is not that of their depth; None for others.
+    EV003 if they do not agree."""
+    named: dict[int, Path] = {}
+    for file in files:
+        if file.suffix.lower() in NETPBM:
+            with contextlib.suppress(OSError), open(need_regular(file), "rb") as f:
+                if white := stated_white(f.read(HEAD)):
+                    named.setdefault(white, file)
+    if not named.keys() - USUAL:
+        return None
+    if len(named) > 1:
+        (white, file), (other, another) = [*named.items()][:2]
+        raise EvflowDataError(
+            "EV003", f"{file.name} names {white} as white (maxval), {another.name} {other}.",
+            "Save them with one white (netpbm: pamdepth), or pass it: --full-scale (full_scale=).",
+            where=file.parent)
+    return next(iter(named))
 
 
 def opaque(pixels: np.ndarray, background: str) -> tuple[np.ndarray, bool]:

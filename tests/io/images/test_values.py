@@ -230,3 +230,38 @@ def test_integers_of_few_bits_in_sixteen_need_their_white(
     late = np.concatenate([frames, 65535 // frames.max() * frames])  # begins in the dark
     np.save(tmp_path / "a.npy", late)
     assert len(list(open_frames(tmp_path / "a.npy", fps=30).open())) == 6
+
+
+def netpbm(path: Path, kind: str, codes: np.ndarray, white: int) -> None:
+    """Codes (H, W, 3) in R, G, B, or (H, W), of a file whose maxval is `white`."""
+    body = (" ".join(map(str, codes.ravel())).encode() + b"\n" if kind in ("P2", "P3") else
+            codes.astype("u1" if white < 256 else ">u2").tobytes())
+    height, width = codes.shape[:2]
+    path.write_bytes(f"{kind}\n# by hand\n{width} {height}\n{white}\n".encode() + body)
+
+
+@pytest.mark.parametrize("kind", ["P2", "P3", "P5", "P6"])
+@pytest.mark.parametrize(("white", "told"), [
+    (100, True), (255, False), (1023, True), (16383, True), (65535, False)])
+def test_a_pgm_names_its_white(tmp_path: Path, kind: str, white: int, told: bool) -> None:
+    for i, light in enumerate(LIGHT / LIGHT.max()):
+        code = np.rint(white * light).astype(int)
+        netpbm(tmp_path / f"{i}.pgm", kind,
+               np.stack([code] * 3, -1) if kind in ("P3", "P6") else code, white)
+    frames, _, notes = read(tmp_path, fps=10)
+    np.testing.assert_allclose(frames, 255 * LIGHT / LIGHT.max(), atol=1 + 255 / white / 2)
+    said = [note.text for note in notes if note.code == "frames.white"]
+    text_of_bytes = white == 100 and kind in ("P2", "P3")  # which OpenCV scales
+    assert said == ([f"{white} is white, as the images say (maxval); --full-scale sets another "
+                     "value."] if told and not text_of_bytes else [])
+    if white > 255:
+        other = read(tmp_path, fps=10, full_scale=2.0 * white)[0]
+        np.testing.assert_allclose(other, frames / 2, atol=1e-4)
+
+
+def test_pgms_that_name_two_whites_are_refused(tmp_path: Path) -> None:
+    for i, white in enumerate((1023, 4095)):
+        netpbm(tmp_path / f"{i}.pgm", "P5", np.full((4, 6), 500), white)
+    assert "0.pgm names 1023 as white (maxval), 1.pgm 4095" in message(
+        lambda: read(tmp_path, fps=10))
+    assert read(tmp_path, fps=10, full_scale=4095)[0].max() == pytest.approx(31.1, abs=0.1)
