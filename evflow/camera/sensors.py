@@ -174,8 +174,8 @@ class SensorModel(_Numbers):
         leak_fpn_decades: spread of the leak's fixed pattern over pixels, in decades.
         shot_hz: v2e's shot-noise rate in Hz, both polarities together, on top of the camera's eta.
         eta_is_all: the camera's eta is all of its noise, as for a measured camera: leak is a part
-            of eta_on, and shot_hz says how large the rest would be in the dark, spread over pixels
-            as eta is. False: leak and shot noise come on top of eta.
+            of eta_on and has run before the first frame, and shot_hz says how large the rest would
+            be in the dark, spread over pixels as eta is. False: leak and shot noise come on top.
         eta_intensity: let eta follow ((F-1) I01 + 1) of Eq. 12 (F = 0.25), relative to the mean
             of the first frame.
         noise_resets_memory: a noise event stores the present log intensity (v2e, real pixels);

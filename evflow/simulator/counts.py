@@ -40,7 +40,8 @@ def simulate_counts(
     """Events per pixel and polarity of a video; jit, vmap and differentiate it.
 
     Args:
-        key: of jax.random; with smooth > 0 it only draws the leak's pattern.
+        key: of jax.random; with smooth > 0 it only draws the leak's pattern
+            and phases.
         log_frames: (T, H, W), T >= 2: natural-log intensity in the map of `model.log_map`, or
             uint8 DN that pass through that map.
         camera: maps (H, W).

@@ -134,18 +134,19 @@ def possible(camera: Camera, model: Constants, dt: Array) -> tuple[Camera, Array
 
 def start(
     key: Array, log_frame: Array, camera: Camera, model: Constants,
-    nominal: Array | None, phase: Array | float = 0.0,
+    nominal: Array | None, phase: Array | float | None = None,
 ) -> tuple[Sensor, SimState]:
     """The sensor and its state after the first log frame; maps of any one shape, kept flat.
 
     nominal: `noise.nominal_thresholds`; None: no noise. phase: initial contrast of the pixels (log
-    units, a map; 0 as in v2e); that of a running camera is uniform in (-theta_off, theta_on).
+    units, a map); that of a running camera is uniform in (-theta_off, theta_on). None: 0 as in v2e;
+    where eta is all noise, as of a measured camera, what leaked since an event (`_leaked`).
     """
     k_leak, k_words, k_intervals = jax.random.split(key, 3)
     count = math.prod(log_frame.shape)
     flat = jax.tree.map(lambda m: m.reshape(count), camera)
     flat = pixel.exact(flat) if model.kind == "esim" else flat
-    base = (log_frame - phase).reshape(count)
+    base = (log_frame - (0.0 if phase is None else phase)).reshape(count)
     log_i = log_frame.reshape(count)
     reference = jnp.mean(i01_of(model, log_i))
     pattern = noise.leak_pattern(model, k_leak, (count,))
@@ -155,12 +156,27 @@ def start(
         None if nominal is None else noise.rates(model, flat, reference, nominal),
         noise.leak_rates(model, flat.theta_on, pattern) if model.leak_hz is not None else None,
     )
+    if phase is None and model.eta_is_all and sensor.leaking is not None:
+        base = base - _leaked(model, sensor, reference)
     last = jnp.full_like(log_i, pixel.never_fired(model))
     inner = None if model.photoreceptor is None else second_order.at_rest(log_i)
     owed = jnp.zeros_like(log_i) if model.carries_leak else None
     pixels = PixelState(log_i, base, last, inner, owed)
     return sensor, SimState(
         pixels, jnp.zeros((), jnp.int32), jnp.zeros(2, jnp.float32), k_intervals)
+
+
+def _leaked(model: Constants, sensor: Sensor, reference: Array) -> Array:
+    """The contrast (N,) of pixels of a running camera that sees no motion: leak since the last
+    event, at most a threshold. The time since then is uniform up to the leak's period, or where
+    noise resets the memory, exponential with its rate."""
+    theta = jnp.minimum(sensor.camera.theta_on, noise.LEAK_THETA)
+    u = jnp.minimum(noise.uniform(noise.scramble(sensor.words)), 0.999999)
+    if sensor.rates is None or not model.noise_resets_memory:
+        return theta * u
+    rate = sum(sensor.rates.at(reference))
+    many = jnp.maximum(rate * theta / jnp.maximum(sensor.leaking, 1e-12), 1e-3)  # in a period
+    return theta * (-jnp.log1p(u * jnp.expm1(-many)) / many)
 
 
 def i01_of(model: Constants, log_i: Array) -> Array:

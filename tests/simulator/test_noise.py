@@ -180,6 +180,22 @@ def test_leak_is_a_part_of_eta_that_is_all_noise() -> None:
     assert 12.0 - alone == pytest.approx((alone + 6.0) / np.expm1((alone + 6.0) / 8.0), rel=1e-3)
 
 
+@pytest.mark.parametrize("resets", [False, True])
+def test_leak_of_a_measured_camera_has_run_before(resets: bool) -> None:
+    """Half a period of the leak has as much of it as any other, at no time more than at others."""
+    model = SensorModel(leak_hz=2.0, eta_is_all=True, noise_resets_memory=resets)
+    events = still(model, (3.0, 1.0), 0.25)
+    assert events.p.sum() / 4096 / 0.25 == pytest.approx(3.0, rel=0.07)  # 3,072, to 4 sd
+    counts = np.histogram(events.t[events.p], 10, (0, 250_000))[0]
+    np.testing.assert_allclose(counts, 307, atol=80)
+    counts = simulate_counts(
+        jax.random.key(2), np.broadcast_to(BANDS, (26, *SHAPE)).astype(np.uint8),
+        Camera.constant(SHAPE, 0.2, 0.2, 3.0, 1.0), frame_dt_s=0.01, model=model)
+    np.testing.assert_array_equal(counts, np.moveaxis(events.count_map(), 0, -1))
+    alone = still(SensorModel(leak_hz=2.0, noise_resets_memory=resets), (0.0, 0.0), 0.49)
+    assert len(alone) == 0  # v2e's begins with the video
+
+
 def test_eta_that_is_all_noise_follows_light_where_there_is_shot_noise() -> None:
     """As much of it in all as shot_hz says, as uneven as eta is."""
     model = Constants.of(SensorModel(shot_hz=6.0, eta_is_all=True))
