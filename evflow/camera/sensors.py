@@ -167,8 +167,8 @@ class SensorModel(_Numbers):
         cutoff_hz: corner frequency of the first-order low-pass at 255 DN; 0 = off.
         cutoff_by_light: let the corner be proportional to intensity, as in v2e; False: the same at
             any light, as when a later stage, not the photoreceptor, limits the bandwidth.
-        refractory_s: dead time after an event in seconds; with "v2e" the contrast is kept and
-            fires later.
+        refractory_s: dead time after an event of light or leak in seconds; with "v2e" the contrast
+            is kept and fires later. Noise events (eta, shot_hz) neither wait for it nor begin it.
         leak_hz: ON leak events per second.
         leak_jitter: relative jitter of each leak step.
         leak_fpn_decades: spread of the leak's fixed pattern over pixels, in decades.

@@ -63,7 +63,8 @@ class Pixels:
     in bright light, with a source follower and an amplifier that events reset. Its corner in the
     dark is --cutoff-hz, or the camera's, or 199 Hz."""
     refractory_s: Annotated[float | None, value("SECONDS", "--refractory")] = None
-    """Time after an event during which a pixel sends no other (v2e: .0005)."""
+    """Time after an event of light or leak during which a pixel sends no other (v2e: .0005); noise
+    events ignore it."""
     leak_hz: Annotated[float | None, value("HZ", "--leak")] = None
     """ON leak events per second and pixel, without light changes; for a measured camera they come
     on top of all its noise."""

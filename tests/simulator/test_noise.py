@@ -171,6 +171,14 @@ def test_leak_too_small_for_float32_is_carried_on(photoreceptor: SecondOrder | N
         np.testing.assert_allclose(smooth.ravel(), [2.5 - 0.9, 0.0], atol=0.01)
 
 
+def test_noise_ignores_the_dead_time() -> None:
+    """As the help of --refractory-s says."""
+    dead, free = (still(SensorModel(refractory_s=s), (20.0, 10.0), 0.5) for s in (0.05, 0.0))
+    for name in ("x", "y", "t", "p"):
+        np.testing.assert_array_equal(getattr(dead, name), getattr(free, name))
+    assert min(np.diff(t)[np.diff(pixel) == 0].min() for pixel, t, _ in [by_pixel(dead)]) < 1000
+
+
 def test_leak_is_a_part_of_eta_that_is_all_noise() -> None:
     model = SensorModel(leak_hz=8.0, eta_is_all=True, noise_resets_memory=True)
     on, off = still(model, (12.0, 6.0), 4.0).count_map().reshape(2, -1).mean(1) / 4.0
