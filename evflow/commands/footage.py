@@ -37,7 +37,8 @@ class Footage:
     its times are divided by this factor."""
     repeated: Literal["keep", "drop"] = "keep"
     """Frames that repeat the one before while the scene moves, as frame-rate converters insert
-    them: drop leaves them out."""
+    them: drop leaves them out. Not for slides, a screen or a blinking light, whose repeats are
+    true."""
     colour: Colour = "luma"
     """What a pixel sees of colour: luma, or its channel under this Bayer mosaic. Frames with one
     channel are taken as the mosaic itself."""

@@ -2,7 +2,7 @@
 
 A camera would see no change at the repeat and a double step after it. A static scene repeats its
 frames too, but many times: only short runs are attributed to a converter, and longer ones if they
-all have the same length.
+all have the same length. Where frames mostly go back to the one before the last, a light blinks.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ from evflow.light.colour import Frames
 from evflow.notes import Note
 
 LONGEST = 4  # times a converter shows a frame; more, and the scene is static
-LONGEST_ALIKE, MOVES_DN = 12, 1.0  # ... unless three frames in a row are shown equally often and
-# change this much in between: 5 frames a second at 60
+LONGEST_ALIKE, MOVES_DN = 12, 1.0  # ... unless frames in a row are shown equally often and change
+# this much in between: 5 frames a second at 60
+IN_ROW = 5  # so many: fewer may be slides, or a screen that scrolls
 ALIKE, NOISE_DN = 0.05, 0.5  # residual of compression: share of the previous change, mean DN
 SAMPLED = 4  # every 4th pixel of every 4th row is compared first
 HIDDEN = 255.0  # DN: assumed change before the first frame
@@ -27,21 +28,24 @@ HIDDEN = 255.0  # DN: assumed change before the first frame
 @dataclasses.dataclass
 class Runs:
     """Frames and their repeats, collected as they are read. times: of all frames in us; firsts:
-    indices of frames that are not repeats; changes: their difference to the previous, mean DN."""
+    indices of frames that are not repeats; changes: their difference to the previous, mean DN;
+    returned: how many of them show the one before the previous again."""
 
     times: list[int] = dataclasses.field(default_factory=list)
     firsts: list[int] = dataclasses.field(default_factory=list)
     changes: list[float] = dataclasses.field(default_factory=list)
+    returned: int = 0
 
     def watched(self, pairs: Frames) -> Frames:
         """The (frame, time) pairs, recorded as they pass."""
-        held = None
+        held = former = None
         for frame, time in pairs:
             before = self.changes[-1] if self.changes else HIDDEN
             most = min(NOISE_DN, ALIKE * before)  # residual of compression
             change = HIDDEN if held is None else _change(held, frame, most)
             if held is None or change > most:
-                held = frame
+                self.returned += former is not None and _change(former, frame, most) <= most
+                held, former = frame, held
                 self.firsts.append(len(self.times))
                 self.changes.append(change)
             self.times.append(time)
@@ -50,13 +54,12 @@ class Runs:
     def repeats(self) -> np.ndarray:
         """Whether each frame is a converter's repeat, (T,) bool."""
         lengths = np.diff([*self.firsts, len(self.times)])
-        if len(lengths) < 2:  # a static scene
+        if len(lengths) < 2 or 2 * self.returned > len(lengths):  # a static scene, a blinking light
             return np.zeros(len(self.times), bool)
         alike = np.abs(np.diff(lengths)) <= 1
-        three = alike[1:] & alike[:-1]
         many = np.zeros(len(lengths), bool)
-        for k in range(3):
-            many[k:len(lengths) - 2 + k] |= three
+        for k in range(len(lengths) - IN_ROW + 1):
+            many[k:k + IN_ROW] |= alike[k:k + IN_ROW - 1].all()
         moves = np.array(self.changes) >= MOVES_DN
         short = (lengths <= LONGEST) | (many & moves & (lengths <= LONGEST_ALIKE))
         shown_again = np.repeat(short, lengths)
@@ -82,7 +85,8 @@ class Runs:
         count = int(self.repeats().sum()) if self.times else 0
         return None if count < 2 else Note(
             "frames.repeated", f"{_said(count, len(self.times))}: they give no events, and a "
-            "double step after; --repeated drop leaves them out.")
+            "double step after; --repeated drop leaves them out (not of slides, a screen or a "
+            "blinking light, which really stay as they are).")
 
 
 def dropped(open_again: Callable[[], Frames], notes: list[Note]) -> Frames:

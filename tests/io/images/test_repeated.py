@@ -37,13 +37,14 @@ def shown(tmp_path: Path, order: np.ndarray, noise: int = 0, **hints: Any) -> tu
     (PULLDOWN, 6), (np.repeat(np.arange(8), 2), 8), (np.repeat(np.arange(8), 3), 16),
     (np.arange(24), 0), (STILL, 0), (STILL[::-1], 0), (np.zeros(9, int), 0), (LOST, 4),
     (np.array([0, 1, 2, 2, 3, 4, 5, 6, 6, 7]), 2), (np.repeat(np.arange(6), 5), 24),
-    (np.repeat(np.arange(5), 10), 45), (np.repeat(np.arange(3), [20, 6, 9]), 0)])
+    (np.repeat(np.arange(5), 10), 45), (np.repeat(np.arange(3), [20, 6, 9]), 0),
+    (np.repeat([0, 30, 60], 10), 0), (np.tile([0, 1, 1], 20), 0), (np.tile([0, 0, 3, 3], 10), 0)])
 @pytest.mark.parametrize("noise", [0, 1])
 def test_repeated_frames_are_counted_and_dropped(
     tmp_path: Path, order: np.ndarray, repeats: int, noise: int
 ) -> None:
     """Also where a codec leaves a little of them; a scene that stands still is none of a
-    converter's."""
+    converter's, nor are pages that turn or a light that blinks."""
     first = np.flatnonzero(np.diff(order, prepend=-1)) if repeats else np.arange(len(order))
     for hints in ({}, {"repeated": "drop"}):
         frames, times, notes = shown(tmp_path, order, noise, **hints)
