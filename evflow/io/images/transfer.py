@@ -44,15 +44,15 @@ def hdr_curve(path: Path) -> str | None:
 
 
 def _of_boxes(f: IO[bytes]) -> str | None:
-    index = _box(f, b"moov")
-    for box in BOXES:
-        at = index.find(box)
+    index = box(f, b"moov")
+    for colours in BOXES:
+        at = index.find(colours)
         if at >= 0:
             return CURVES.get(int.from_bytes(index[at + 10:at + 12], "big"))
     return None
 
 
-def _box(f: IO[bytes], name: bytes) -> bytes:
+def box(f: IO[bytes], name: bytes) -> bytes:
     """The first INDEX bytes of a box of the file; empty if there is none."""
     at = 0
     while True:

@@ -24,12 +24,12 @@ from evflow.io.images.frames import FrameHints, Image, existing
 from evflow.io.images.matroska import first_stamp_s
 from evflow.io.images.stacks import cut_off
 from evflow.io.images.times import read_times
-from evflow.io.images.transfer import hdr_note
+from evflow.io.images.transfer import box, hdr_note
 from evflow.notes import Note
 
 SLACK = 1.5  # frames; containers without a count derive it from their rounded duration
 SLACK_SHARE = 0.001
-REST = "the rest is missing, damaged, or trimmed away by an edit list"
+REST = "the rest is missing or damaged"
 BLACK, NOT_BLACK = 2, 1e-3  # code value; share of bytes of a black picture that may exceed it
 TICK_US = 1000.5  # Matroska and WebM round times to the millisecond
 
@@ -68,7 +68,7 @@ class Video:
         if self.times_us is not None or self.hints.fps is not None or not clock.trusted:
             lost = self.claimed - count
         if lost > _slack(self.claimed) and not self.hints.partial:
-            raise cut_off(self.path, count, self.claimed, REST)
+            raise _short(self.path, count, self.claimed)
         if self.times_us is not None and count < len(self.times_us) and not self.hints.partial:
             raise self._miscounted(f"{count:,}")
         more = clock.notes() + ([_still(self.path, count)] if still and count > 1 else [])
@@ -223,7 +223,22 @@ def _check_end(path: Path, capture: Any, claimed: int) -> None:
         by_time = claimed - 1 - last * 1e-3 * again.get(cv2.CAP_PROP_FPS)
     lost = min(claimed - count, by_time) if last > 0 else claimed - count
     if lost > _slack(claimed):
-        raise cut_off(path, count, claimed, REST)
+        raise _short(path, count, claimed)
+
+
+def _short(path: Path, count: int, claimed: int) -> EvflowDataError:
+    """EV009 for frames that are missing; a whole mp4 with an edit list was probably trimmed."""
+    with open(path, "rb") as f:
+        total = path.stat().st_size
+        whole = f.read(8)[4:] == b"ftyp" and _boxes_end(f, total) == total
+        if not (count and whole and b"elst" in box(f, b"moov")):
+            return cut_off(path, count, claimed, REST)
+    return EvflowDataError(
+        "EV009", f"{count:,} of the {claimed:,} frames of {path} can be read: the others were "
+        "probably trimmed away by its edit list, as a cut without re-encoding leaves them.",
+        "If so, pass --partial (partial=True), or encode it again: ffmpeg -i "
+        f"{quote(path.name)} -c:v libx264 -crf 12 new.mp4. If it was not cut, it is damaged: copy "
+        "it again.", where=path)
 
 
 def _check_bytes(path: Path) -> None:

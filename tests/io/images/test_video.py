@@ -183,3 +183,16 @@ def test_times_of_a_video_from_a_file(tmp_path: Path) -> None:
     for lines in ("0.5\n0.53\n0.6\n", "0.5\n0.53\n0.6\n0.61\n0.7\n0.8\n"):
         log.write_text(lines)
         assert code_of(lambda: list(open_frames(path, timestamps=log).open())) == "EV002"
+
+
+def test_a_cut_without_encoding_is_told_from_damage(tmp_path: Path) -> None:
+    path = clip(tmp_path / "a.mp4", 60, 30.0, "mp4v")
+    data = bytearray(path.read_bytes())
+    scale = struct.unpack_from(">I", data, data.rindex(b"mdhd") + 16)[0]
+    struct.pack_into(">Ii", data, data.rindex(b"elst") + 12, 1500, scale // 2)  # .5 s to the end
+    path.write_bytes(data)
+    said = message(lambda: read(path))
+    assert "45 of the 60 frames" in said
+    assert said.index("trimmed away by its edit list") < said.index("--partial") < said.index(
+        "ffmpeg -i a.mp4") < said.index("damaged: copy it again")
+    assert len(read(path, partial=True)[0]) == 45
