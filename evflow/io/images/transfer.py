@@ -1,7 +1,7 @@
 """The transfer curve of an HDR video, from its container: PQ or HLG (ITU-R BT.2100).
 
 OpenCV 5 tone-maps such a video, OpenCV 4 uses its code values unchanged, and neither says so. The
-colour boxes of MP4 and MOV and the colour elements of Matroska are read.
+colour boxes of MP4 and MOV and the colour elements of Matroska are read, not the bitstream (VUI).
 """
 
 from __future__ import annotations
