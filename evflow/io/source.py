@@ -99,9 +99,9 @@ def _of_images(folder: ImageFolder, asked: FrameHints) -> FrameSource:
         white, note = values.white_of_radiance(first, asked.full_scale)
         asked = dataclasses.replace(asked, full_scale=white, clip=True)
         notes = (*notes, note)
-    if asked.full_scale is None and (white := values.white_of_files(folder.files)):
-        asked = dataclasses.replace(asked, full_scale=white)
-        notes = (*notes, Note("frames.white", f"{white} is white, as the images say (maxval); "
+    if asked.full_scale is None and (named := values.white_of_files(folder.files)):
+        asked = dataclasses.replace(asked, full_scale=named)
+        notes = (*notes, Note("frames.white", f"{named} is white, as the images say (maxval); "
                               "--full-scale sets another value."))
     return _source(size, len(folder.files), folder.images, asked, [*folder.notes, *notes],
                    folder.exposure_us)

@@ -157,7 +157,7 @@ def start(
         noise.leak_rates(model, flat.theta_on, pattern) if model.leak_hz is not None else None,
     )
     if phase is None and model.eta_is_all and sensor.leaking is not None:
-        base = base - _leaked(model, sensor, reference)
+        base = base - _leaked(model, sensor, sensor.leaking, reference)
     last = jnp.full_like(log_i, pixel.never_fired(model))
     inner = None if model.photoreceptor is None else second_order.at_rest(log_i)
     owed = jnp.zeros_like(log_i) if model.carries_leak else None
@@ -166,7 +166,7 @@ def start(
         pixels, jnp.zeros((), jnp.int32), jnp.zeros(2, jnp.float32), k_intervals)
 
 
-def _leaked(model: Constants, sensor: Sensor, reference: Array) -> Array:
+def _leaked(model: Constants, sensor: Sensor, leaking: Array, reference: Array) -> Array:
     """The contrast (N,) of pixels of a running camera that sees no motion: leak since the last
     event, at most a threshold. The time since then is uniform up to the leak's period, or where
     noise resets the memory, exponential with its rate."""
@@ -174,8 +174,8 @@ def _leaked(model: Constants, sensor: Sensor, reference: Array) -> Array:
     u = jnp.minimum(noise.uniform(noise.scramble(sensor.words)), 0.999999)
     if sensor.rates is None or not model.noise_resets_memory:
         return theta * u
-    rate = sum(sensor.rates.at(reference))
-    many = jnp.maximum(rate * theta / jnp.maximum(sensor.leaking, 1e-12), 1e-3)  # in a period
+    on, off = sensor.rates.at(reference)
+    many = jnp.maximum((on + off) * theta / jnp.maximum(leaking, 1e-12), 1e-3)  # in a period
     return theta * (-jnp.log1p(u * jnp.expm1(-many)) / many)
 
 
