@@ -65,8 +65,7 @@ def parts(params: Params) -> tuple[ModelConfig, Params]:
 
 
 def _check_code(config: ModelConfig, code: Code) -> None:
-    """Raise EV020 unless it is a code, EV018 if it is of other weights, EV002 if its parts are not
-    of the same pixels."""
+    """Raise EV020 unless it is a code, EV018 if it is of other weights, EV002 if of two sizes."""
     need(code, Code, "code", "Give that of code_from_video(params, dL, camera), or of encode.")
     width = config.flow.condition if config.code == "feature" else 2 * config.changes
     changes, context = np.shape(code.changes), np.shape(code.context)
@@ -75,9 +74,8 @@ def _check_code(config: ModelConfig, code: Code) -> None:
             "EV018", f"the code's changes have shape {changes}, these weights take (..., H, W, "
             f"{width}).", "Is it of other weights? Make it with these: encode(params, ...).")
     if context != (*changes[:-1], 3):
-        raise EvflowDataError(
-            "EV002", f"the code's changes have shape {changes}, its context {context}.",
-            f"Both must be of the same pixels; expected a context {(*changes[:-1], 3)}.")
+        raise EvflowDataError("EV002", f"the code's changes have shape {changes}, its context "
+                              f"{context}.", f"Expected a context {(*changes[:-1], 3)}.")
 
 
 def pixel_context(window_s: Array, intensity: Array | None, shape: tuple[int, ...]) -> Array:
