@@ -286,12 +286,14 @@ def test_r_is_held_against_what_is_possible() -> None:
     assert [j.grade for j in judged] == ["good", "good"]
 
 
-def test_motion_that_is_lost_comes_before_all_other_reasons() -> None:
+def test_a_known_reason_comes_before_all_others() -> None:
     ceiling = {"on": 1.0, "off": 1.0}
     clocked, lost = (judge_stream(stream(0.7, 0.9), "on", "re-simulated", ceiling, gone)[0].advice
                   for gone in (False, True))
     assert "clocks" in clocked
     assert "higher frame rate, comes first" in lost
+    many = judge_stream(stream(1.4, 0.9), "on", "re-simulated", ceiling, kept=True)[0]
+    assert "dead time" in many.advice
 
 
 def test_what_could_not_be_tested_is_fair_at_best() -> None:
