@@ -23,7 +23,7 @@ from evflow.dataset.generate import make_sequence
 from evflow.dataset.manifest import Manifests, Part, Progress, Record
 from evflow.dataset.store import Format, write_sequence
 from evflow.errors import EvflowDataError
-from evflow.files.atomic import atomic_write
+from evflow.files.atomic import put_in_place, written_aside
 from evflow.process.workers import worker_pool
 
 DRAFTS = ".drafts-"
@@ -140,7 +140,7 @@ def _wanted(
 
 def _commit(draft: Path, final: Path) -> None:
     """Rename a draft into place, over any damaged sequence."""
-    with atomic_write(final, overwrite=True) as temporary:
+    with written_aside(final, put_in_place, overwrite=True) as temporary:
         if final.is_dir():
             shutil.rmtree(final)
         os.replace(draft, temporary)

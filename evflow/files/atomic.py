@@ -54,7 +54,7 @@ def atomic_write(path: str | os.PathLike, *, overwrite: bool = False) -> Iterato
     write of `path`.
     """
     need_no_folder(path)
-    with written_aside(path, _move, overwrite=overwrite) as temporary:
+    with written_aside(path, put_in_place, overwrite=overwrite) as temporary:
         yield temporary
 
 
@@ -117,7 +117,8 @@ def behind_links(path: Path) -> Path:
     return target
 
 
-def _move(temporary: Path, path: Path, overwrite: bool) -> None:
+def put_in_place(temporary: Path, path: Path, overwrite: bool) -> None:
+    """Rename what was written; without `overwrite`, EV013 if `path` exists by now."""
     if overwrite:
         os.replace(temporary, path)
     else:
