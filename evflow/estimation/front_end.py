@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -47,16 +46,11 @@ def find_front_end(stretches: Sequence[Stretch], *, measured: bool) -> FrontEnd:
         return FrontEnd(dead=dead, faulty=faulty)
     noise_dn = frame_noise([(recording, i) for recording, run in runs for i in run])
     films: Films = {}
-    found, lost = (find_photoreceptor(runs, noise_dn, films, **searched_with(dead)) if measured
-                   else (None, None))
+    found, lost = (find_photoreceptor(runs, noise_dn, films, shortest_s=dead.shortest_s,
+                                      sharp=dead.measured) if measured else (None, None))
     blur_s = 1e-6 * float(np.mean([recording.exposure_us for recording, _ in runs]))
     seen_by = found.used if found else IDEAL
     return FrontEnd(seen_by, noise_dn, blur_s, found, begun_anew(dead, lost), lost, faulty, films)
-
-
-def searched_with(dead: DeadTime) -> dict[str, Any]:
-    """What `find_photoreceptor` is told of the intervals between events."""
-    return {"shortest_s": dead.shortest_s, "sharp": dead.measured}
 
 
 def begun_anew(dead: DeadTime, lost: Lost | None) -> DeadTime:

@@ -14,7 +14,7 @@ import numpy as np
 
 from evflow.estimation.dead_time import dead_time, first_events
 from evflow.estimation.finish import estimate
-from evflow.estimation.front_end import begun_anew, searched_with
+from evflow.estimation.front_end import begun_anew
 from evflow.estimation.refine import Stretch, find_photoreceptor, make_chunk, simulated_part
 from evflow.estimation.refine.path import STEPS
 from evflow.estimation.refine.photoreceptor import receptor_places
@@ -85,7 +85,8 @@ def _on_its_own(first: FirstPart) -> State:
     dead = dead_time(first_events(events.slice(int(events.t[0]), end)))
     found, lost = front_end.found, front_end.lost
     if found is not None and receptor_places(runs) != receptor_places(searched):
-        found, lost = find_photoreceptor(runs, front_end.noise_dn, **searched_with(dead))
+        found, lost = find_photoreceptor(
+            runs, front_end.noise_dn, shortest_s=dead.shortest_s, sharp=dead.measured)
     seen_by = found.used if found is not None else IDEAL
     own = dataclasses.replace(front_end, seen_by=seen_by, found=found,
                               dead=begun_anew(dead, lost), lost=lost, films={})

@@ -20,6 +20,7 @@ Array = np.ndarray
 REACH = 0.5  # of a threshold: what the light of a rested pixel may have changed
 LEAST_THETA = 0.1  # log units: that of usable cameras, where the threshold is undetermined
 STEADY = 0.05  # log units: change of a pixel in a window, beyond which something moves there
+TILES, ALIKE = (4, 4), 4.0  # of the view, and standard deviations of their mean from 0, in a block
 BLOCK_S = 1.0  # the light's ups and downs are added over such times: noise of frames averages out
 LEAST_SHARE = 0.15  # of the noise: fewer events by drift are not looked for
 LESS, UNLIKE = 3.0, 0.05  # standard deviations by which rested pixels must send fewer events, and
@@ -59,28 +60,38 @@ class Drift:
 
     def __init__(self) -> None:
         self._moved = np.zeros(2)  # log units, up and down
-        self._block, self._block_s = 0.0, 0.0
+        self._block, self._block_s = np.zeros(TILES), 0.0
         self.seconds = 0.0
 
     def add(self, change: Array, shown: Array, seconds: float) -> float:
         """Add a window's change (H, W) of log intensity, of pixels that are shown (H, W); returns
         the mean of those that hardly change."""
         steady = shown & (np.abs(change) < STEADY)
-        common = float(change[steady].mean(dtype=np.float64)) if steady.any() else 0.0
-        self._block, self._block_s = self._block + common, self._block_s + seconds
+        counts, sums = (_by_tile(v) for v in (steady, np.where(steady, change, 0.0)))
+        self._block += sums / np.maximum(counts, 1)
+        self._block_s += seconds
         self.seconds += seconds
         if self._block_s >= BLOCK_S:
             self._moved += self._open()
-            self._block, self._block_s = 0.0, 0.0
-        return common
+            self._block, self._block_s = np.zeros(TILES), 0.0
+        return float(sums.sum() / max(counts.sum(), 1))
 
     def _open(self) -> Array:
-        return np.maximum([self._block, -self._block], 0.0)
+        """(2,) of the block: light changes alike all over the view, what moves does not."""
+        common, apart = self._block.mean(), self._block.std(ddof=1) / np.sqrt(self._block.size)
+        return np.maximum([common, -common], 0.0) * (abs(common) > ALIKE * apart)
 
     @property
     def per_second(self) -> Array:
         """(2,) log units per second, risen and fallen."""
         return np.asarray((self._moved + self._open()) / max(self.seconds, 1e-9))
+
+
+def _by_tile(values: Array) -> Array:
+    """Sums (TILES) of values (H, W)."""
+    rows, columns = (np.linspace(0, n, k, endpoint=False).astype(int)
+                     for n, k in zip(values.shape, TILES, strict=True))
+    return np.add.reduceat(np.add.reduceat(values.astype(np.float64), rows, 0), columns, 1)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -30,6 +30,7 @@ CLEARLY = 6.0  # log odds required against a pixel that keeps its contrast
 # A pixel that begins anew needs a threshold's worth of change after its dead time, which is
 # therefore a part of its shortest intervals: these parts are tried, and then those about the best.
 COARSE, FINE = (0.25, 0.5, 0.75, 1.0), np.arange(-0.2, 0.21, 0.05)
+NEGLIGIBLE = 0.02  # log units of a threshold, less than what is known of it
 LEAST = 1e-3  # log units, of a threshold
 ROUNDS = 3  # of thresholds and whole events lost, each from the other
 SHARE_ERROR = 0.3  # of the correction, in logarithms: of 17 cameras one scene alone was farther off
@@ -73,8 +74,7 @@ def lost_contrast(
         return found, None
     if best.law == "resets":
         finer = best.dead_s + FINE * shortest_s
-        best = max((_way(data, best.seen_by, "resets", dead_s) for dead_s in finer[finer > 0]),
-                   key=lambda way: way.gain)
+        best = max(_resets(data, best.seen_by, finer[finer > 0]), key=lambda way: way.gain)
     again = find(best.data)
     if again is None:
         return found, None
@@ -82,6 +82,8 @@ def lost_contrast(
     if size * np.log(before / after) < CLEARLY:
         return found, None
     excess = np.divide(*(_solved(some, again.used)[0] for some in (data, best.data)))
+    if np.abs(np.log(excess)).max() < NEGLIGIBLE:
+        return found, None
     error = float(FINE[1] - FINE[0]) if best.law == "resets" else 0.02
     return (dataclasses.replace(again, theta=again.theta * excess,
                                 ideal_theta=again.ideal_theta * excess),
@@ -103,18 +105,23 @@ def _ways(
     data: Sample, seen_by: Photoreceptor, shortest_s: float, *, sharp: bool
 ) -> Iterator[Way]:
     if sharp:
-        yield _way(data, seen_by, "drops", shortest_s)
-    for share in COARSE:
-        yield _way(data, seen_by, "resets", share * shortest_s)
+        yield _drops(data, seen_by, shortest_s)
+    yield from _resets(data, seen_by, np.array(COARSE) * shortest_s)
 
 
-def _way(data: Sample, seen_by: Photoreceptor, law: Law, dead_s: float) -> Way:
+def _drops(data: Sample, seen_by: Photoreceptor, dead_s: float) -> Way:
     theta, kept = _solved(data, seen_by)
-    for _ in range(ROUNDS if law == "drops" else 1):
-        whole = np.maximum(np.abs(theta), LEAST) if law == "drops" else None
-        taken_out = _without(data, seen_by, dead_s, whole)
+    for _ in range(ROUNDS):
+        taken_out = _without(data, seen_by, dead_s, np.maximum(np.abs(theta), LEAST))
         theta, left = _solved(taken_out, seen_by)
-    return Way(kept - left, law, dead_s, seen_by, taken_out)
+    return Way(kept - left, "drops", dead_s, seen_by, taken_out)
+
+
+def _resets(data: Sample, seen_by: Photoreceptor, dead_s: Array) -> Iterator[Way]:
+    _, kept = _solved(data, seen_by)
+    for seconds in dead_s.tolist():
+        taken_out = _without(data, seen_by, seconds)
+        yield Way(kept - _solved(taken_out, seen_by)[1], "resets", seconds, seen_by, taken_out)
 
 
 def _solved(data: Sample, seen_by: Photoreceptor) -> tuple[Array, float]:
