@@ -36,6 +36,9 @@ CHANGES: dict[str, dict[str, Any]] = {
     "dark light 24 DN": {"dark_dn": 24.0},
     "ESIM's logarithm": {"model": SensorModel(log_map="log_eps", noise_resets_memory=True)},
     **{f"dead time {ms} ms": {"model": SensorModel(refractory_s=ms * 1e-3)} for ms in (1, 5)},
+    "dead time 2 ms, held in reset": {"model": SensorModel(
+        photoreceptor=SecondOrder().at(5000.0), refractory_s=2e-3)},
+    "dead time 5 ms, ESIM's": {"model": SensorModel(kind="esim", refractory_s=5e-3)},
     "leak .3 Hz": {"model": SensorModel(leak_hz=0.3, leak_jitter=0.1, noise_resets_memory=True)},
     "leak .3 Hz, 10 s, background at rest": {
         "model": SensorModel(leak_hz=0.3, leak_jitter=0.1, noise_resets_memory=True),
