@@ -9,12 +9,12 @@ settings, each with its thresholds.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Literal
+from typing import Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from evflow.camera.numbers import Numbers, is_off, settle
 from evflow.checks import require
 from evflow.errors import EvflowDataError
 
@@ -24,6 +24,7 @@ SENSOR_SIZES: dict[str, tuple[int, int]] = {  # (width, height)
     "gen31": (640, 480), "gen4": (1280, 720), "imx636": (1280, 720), "evk4": (1280, 720),
     "celex5": (1280, 800)}
 LogMap = Literal["auto", "linlog", "log_eps"]
+DeadContrast = Literal["keeps", "drops", "resets"]
 KINDS = ("v2e", "esim", "voltmeter", "paper")
 # Options that do not apply to a kind of circuit.
 WITHOUT = {
@@ -40,49 +41,9 @@ NUMBERS = ("cutoff_hz", "refractory_s", "leak_hz", "leak_jitter", "leak_fpn_deca
 SWITCHES = ("cutoff_by_light", "eta_is_all", "eta_intensity", "noise_resets_memory")
 
 
-def is_off(value: Any) -> bool:
-    """Whether a number is known to be 0: a traced one may have any value."""
-    return isinstance(value, int | float) and value == 0
-
-
-def _settle(config: Any, name: str, low: float, rule: str) -> None:
-    """Turn a numeric field into a float; raises EV020 unless it is finite and at least `low`.
-    Of traced numbers, which cannot raise, such ones become NaN."""
-    value = getattr(config, name)
-    require(config, name, np.ndim(value) == 0, "one number; jax.vmap takes several")
-    if isinstance(value, jax.core.Tracer):
-        good = jnp.isfinite(value) & (value >= low)
-        object.__setattr__(config, name, jnp.where(good, value, jnp.nan))
-        return
-    number = np.asarray(value).dtype.kind in "biuf"
-    require(config, name, number and bool(np.isfinite(value)) and value >= low, rule)
-    object.__setattr__(config, name, float(value))
-
-
-class _Numbers:
-    """A frozen dataclass as a pytree whose leaves are the fields named in `leaves`, which is
-    decided at construction. Unflattening checks nothing: JAX also puts tangents and placeholders
-    back."""
-
-    leaves: tuple[str, ...]
-
-    def tree_flatten_with_keys(self) -> tuple[tuple[tuple[Any, Any], ...], Any]:
-        """Leaves with their names, and everything else, including `leaves`."""
-        leaves = tuple((jax.tree_util.GetAttrKey(n), getattr(self, n)) for n in self.leaves)
-        return leaves, tuple((n, v) for n, v in vars(self).items() if n not in self.leaves)
-
-    @classmethod
-    def tree_unflatten(cls, structure: Any, leaves: Any) -> Any:
-        """Rebuild the dataclass."""
-        made = object.__new__(cls)
-        vars(made).update(structure)
-        vars(made).update(zip(made.leaves, leaves, strict=True))
-        return made
-
-
 @jax.tree_util.register_pytree_with_keys_class
 @dataclasses.dataclass(frozen=True)
-class Voltmeter(_Numbers):
+class Voltmeter(Numbers):
     """Constants of DVS-Voltmeter (Lin et al., ECCV 2022, Eq. 10 and 11), for DN on 0..255 and
     times in us; a pytree.
 
@@ -102,12 +63,12 @@ class Voltmeter(_Numbers):
         object.__setattr__(self, "leaves", tuple(f.name for f in dataclasses.fields(self)))
         for name in self.leaves:  # the leak, k4 + k5 L, may have either sign
             low = {"k1": 1e-30, "k2": 1e-30, "k4": -np.inf, "k5": -np.inf}.get(name, 0.0)
-            _settle(self, name, low, f"finite, and at least {low:g}")
+            settle(self, name, low, f"finite, and at least {low:g}")
 
 
 @jax.tree_util.register_pytree_with_keys_class
 @dataclasses.dataclass(frozen=True)
-class SecondOrder(_Numbers):
+class SecondOrder(Numbers):
     """Time constants in seconds of a photoreceptor of second order, its source follower, and a
     differencing amplifier that events reset (Low and Lee, "Deblur e-NeRF", ECCV 2024); a pytree.
 
@@ -130,7 +91,7 @@ class SecondOrder(_Numbers):
         object.__setattr__(self, "leaves", tuple(f.name for f in dataclasses.fields(self)))
         for name in self.leaves:
             low = 1e-9 if name in ("input_s", "output_s") else 0.0
-            _settle(self, name, low, f"finite, and at least {low:g}")
+            settle(self, name, low, f"finite, and at least {low:g}")
 
     def at(self, cutoff_hz: float) -> SecondOrder:
         """The same with a faster or slower photoreceptor, such that in the dark it is a first-order
@@ -147,7 +108,7 @@ DVS240 = Voltmeter(4.4241, 23.0, 2e-4, 1e-7, 5e-8, 1e-5)
 
 @jax.tree_util.register_pytree_with_keys_class
 @dataclasses.dataclass(frozen=True, repr=False)
-class SensorModel(_Numbers):
+class SensorModel(Numbers):
     """The pixel circuit: what is not per pixel. Frozen, and a pytree of the numbers that are on.
 
     The default is v2e's noise-free pixel with true crossing times. A number that is 0 is off and
@@ -167,8 +128,13 @@ class SensorModel(_Numbers):
         cutoff_hz: corner frequency of the first-order low-pass at 255 DN; 0 = off.
         cutoff_by_light: let the corner be proportional to intensity, as in v2e; False: the same at
             any light, as when a later stage, not the photoreceptor, limits the bandwidth.
-        refractory_s: dead time after an event of light or leak in seconds; with "v2e" the contrast
-            is kept and fires later. Noise events (eta, shot_hz) neither wait for it nor begin it.
+        refractory_s: dead time after an event of light or leak in seconds. Noise events (eta,
+            shot_hz) neither wait for it nor begin it.
+        dead_contrast: what becomes of contrast that changes in the dead time: "keeps" = it fires
+            later (v2e); "drops" = events that fall into it are lost (ESIM); "resets" = the pixel
+            begins anew at its end, as an amplifier held in reset (Lichtsteiner et al. 2008).
+            "auto" is the kind's own, and "resets" with a second-order photoreceptor. Kind "v2e"
+            with crossing times has the choice.
         leak_hz: ON leak events per second.
         leak_jitter: relative jitter of each leak step.
         leak_fpn_decades: spread of the leak's fixed pattern over pixels, in decades.
@@ -182,7 +148,7 @@ class SensorModel(_Numbers):
             False adds it to the stream (the paper).
         voltmeter: constants of kind "voltmeter".
         photoreceptor: a `SecondOrder` in place of the first-order low-pass, for kind "v2e" with
-            crossing times. Light changes within the refractory period are then lost.
+            crossing times.
 
     Raises:
         EvflowDataError: EV020 (an unknown choice, a negative value, a field of another type, or an
@@ -198,6 +164,7 @@ class SensorModel(_Numbers):
     cutoff_hz: float = 0.0
     cutoff_by_light: bool = True
     refractory_s: float = 0.0
+    dead_contrast: DeadContrast | Literal["auto"] = "auto"
     leak_hz: float = 0.0
     leak_jitter: float = 0.0
     leak_fpn_decades: float = 0.0
@@ -224,13 +191,14 @@ class SensorModel(_Numbers):
         if self.log_map == "auto":
             object.__setattr__(self, "log_map", "log_eps" if self.kind == "esim" else "linlog")
         allowed = {"kind": KINDS, "log_map": ("linlog", "log_eps"), "timestamps": (
-            ("crossing", "v2e") if self.kind in ("v2e", "paper") else ("crossing",))}
+            ("crossing", "v2e") if self.kind in ("v2e", "paper") else ("crossing",)),
+            "dead_contrast": ("auto", *self._dead_contrasts())}
         for name, values in allowed.items():
             if getattr(self, name) not in values:
                 raise EvflowDataError(
                     "EV020", f"SensorModel({name}={getattr(self, name)!r}).", f"Choose {values}.")
         for name in NUMBERS:
-            _settle(self, name, 0.0, ">= 0")
+            settle(self, name, 0.0, ">= 0")
         for name in SWITCHES:
             value = getattr(self, name)
             require(self, name, isinstance(value, bool | int | np.bool_) and value in (0, 1),
@@ -253,6 +221,22 @@ class SensorModel(_Numbers):
                 raise EvflowDataError(
                     "EV020", f"SensorModel(kind={self.kind!r}, {name}={getattr(self, name)}).",
                     "It does not apply to this kind: leave it out, or use kind='v2e'.")
+
+
+    def _dead_contrasts(self) -> tuple[DeadContrast, ...]:
+        """The choices that this circuit has, its own first."""
+        if self.photoreceptor is not None:
+            return ("resets",)
+        if self.kind == "esim":
+            return ("drops",)
+        chosen = self.kind == "v2e" and self.timestamps == "crossing"
+        return ("keeps", "drops", "resets") if chosen else ("keeps",)
+
+    @property
+    def in_dead_time(self) -> DeadContrast:
+        """`dead_contrast`, "auto" resolved."""
+        own = self._dead_contrasts()[0]
+        return own if self.dead_contrast == "auto" else self.dead_contrast
 
 
 @dataclasses.dataclass(frozen=True)

@@ -24,8 +24,9 @@ from evflow.camera import Camera
 from evflow.light.log_maps import LOG_MAPS, normalised_intensity, to_log
 from evflow.simulator import noise, pixel, second_order, sensor
 from evflow.simulator.constants import Constants
-from evflow.simulator.pixel import PixelState, Spikes
+from evflow.simulator.pixel import PixelState
 from evflow.simulator.sensor import Sensor
+from evflow.simulator.spikes import Spikes
 
 Array = jax.Array
 T = TypeVar("T")
@@ -110,7 +111,7 @@ def look(
         return (own, active | _beyond(whole.camera, compared - base)), None
 
     active = jnp.zeros(pixels.lp.shape, bool)
-    if model.photoreceptor is not None and model.refractory_s is not None:
+    if model.is_reset:
         active = pixels.last < model.refractory_s  # dead time ends within the block
     (after, active), _ = jax.lax.scan(
         body, (pixels, active), (block.frames[1:], block.dt, block.salts))

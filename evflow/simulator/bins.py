@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from evflow.simulator.pixel import Spikes
+from evflow.simulator.spikes import Spikes
 
 Array = jax.Array
 

@@ -15,12 +15,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from evflow.camera.sensors import NUMBERS, SensorModel, is_off
+from evflow.camera.numbers import is_off
+from evflow.camera.sensors import NUMBERS, SensorModel
 
 Number = Any  # a float, what is traced, or None where it is off
 
 CHOICES = ("kind", "timestamps", "log_map", "cutoff_by_light", "eta_is_all", "eta_intensity",
-           "noise_resets_memory")
+           "noise_resets_memory", "dead_contrast")
 
 AT_ONCE = 1e30  # per second: corner of a low-pass without effect
 NO_TIME = 1e-12  # seconds: dead time without effect
@@ -32,8 +33,8 @@ NO_TIME = 1e-12  # seconds: dead time without effect
 @dataclasses.dataclass(frozen=True)
 class Constants:
     """A `SensorModel`, whose numbers are None where they are off. corner: of the low-pass at 255
-    DN, radians per second. voltmeter: a `Voltmeter`, None for other kinds. photoreceptor: a
-    `SecondOrder`, or None."""
+    DN, radians per second. dead_contrast: "keeps" without a dead time. voltmeter: a `Voltmeter`,
+    None for other kinds. photoreceptor: a `SecondOrder`, or None."""
 
     kind: str
     timestamps: str
@@ -42,6 +43,7 @@ class Constants:
     eta_is_all: bool
     eta_intensity: bool
     noise_resets_memory: bool
+    dead_contrast: str
     corner: Number
     refractory_s: Number
     leak_hz: Number
@@ -61,6 +63,7 @@ class Constants:
         on: dict[str, Any] = {
             name: None if is_off(value := getattr(model, name)) else value for name in NUMBERS}
         on |= {name: getattr(model, name) for name in CHOICES}
+        on["dead_contrast"] = model.in_dead_time if on["refractory_s"] is not None else "keeps"
         return Constants(
             corner=_corner(on.pop("cutoff_hz")), refractory_s=_dead(on.pop("refractory_s")), **on,
             voltmeter=model.voltmeter if model.kind == "voltmeter" else None,
@@ -69,7 +72,13 @@ class Constants:
     @property
     def is_still(self) -> bool:
         """Whether a pixel's memory changes at events only."""
-        return self.corner is None is self.leak_hz and self.photoreceptor is None
+        return (self.corner is None is self.leak_hz and self.photoreceptor is None
+                and not self.is_reset)
+
+    @property
+    def is_reset(self) -> bool:
+        """Whether a pixel's memory is set anew at the end of a dead time."""
+        return self.dead_contrast == "resets"
 
     @property
     def is_dead_between(self) -> bool:
@@ -84,7 +93,7 @@ class Constants:
     @property
     def waits(self) -> bool:
         """Whether an event within the refractory period of another is delayed, not lost."""
-        return self.is_dead_between and self.kind == "v2e" and self.photoreceptor is None
+        return self.is_dead_between and self.dead_contrast == "keeps"
 
     def on_device(self) -> Constants:
         """A copy on the device, for calls of many programs."""

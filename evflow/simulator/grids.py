@@ -21,8 +21,9 @@ from evflow.simulator import noise, sensor, voltmeter
 from evflow.simulator.active import BLOCK, Block
 from evflow.simulator.bins import Schedule
 from evflow.simulator.constants import Constants
-from evflow.simulator.pixel import PixelState, Spikes
+from evflow.simulator.pixel import PixelState
 from evflow.simulator.sensor import Sensor, Struck
+from evflow.simulator.spikes import Spikes
 
 Array = jax.Array
 Weights = tuple[list[Array], list[Array]]  # (ON, OFF), one (N,) per touched bin

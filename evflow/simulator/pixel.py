@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from evflow.camera import Camera
 from evflow.simulator import second_order
 from evflow.simulator.constants import Constants
+from evflow.simulator.spikes import Spikes, begun_anew, crossings, floor_divide, since_last
 
 Array = jax.Array
 
@@ -34,22 +35,6 @@ class PixelState:
     last: Array
     inner: second_order.Inner | None = None
     owed: Array | None = None
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Spikes:
-    """Signal events of one interval. count: float32, positive ON, negative OFF.
-
-    The k-th event (k = 0, 1, ...) falls at max(first + k spacing, earliest + k dead), in
-    fractions of the interval, where dead = refractory / dt. earliest is None for models without
-    waiting, and only the first term applies.
-    """
-
-    count: Array
-    first: Array
-    spacing: Array
-    earliest: Array | None
 
 
 def never_fired(model: Constants) -> Array | float:
@@ -79,16 +64,6 @@ def exact(camera: Camera) -> Camera:
                                theta_off=rounded(camera.theta_off))
 
 
-def floor_divide(a: Array, theta: Array) -> Array:
-    """floor(a / theta) for a >= 0, corrected by the remainder.
-
-    Exact ties are common in 8-bit video; a rounded quotient would shift whole edges.
-    """
-    quotient = jnp.floor(a / theta)
-    remainder = a - quotient * theta
-    return quotient + jnp.where(remainder >= theta, 1.0, 0.0) - jnp.where(remainder < 0, 1.0, 0.0)
-
-
 def low_pass(model: Constants, lp: Array, log_i: Array, i01: Array, dt: Array) -> Array:
     """First-order low-pass, eps = dt 2 pi fc, with fc proportional to intensity i01 (v2e) or
     constant, by the model."""
@@ -108,54 +83,6 @@ def lowered(base: Array, owed: Array | None, by: Array) -> tuple[Array, Array | 
     due = owed + by
     left = base - due
     return left, due - (base - left)
-
-
-def crossings(
-    model: Constants, theta: Array, start: Array, end: Array, last: Array, dt: Array
-) -> tuple[Spikes, Array]:
-    """Events at the crossings of the interpolated contrast, and the number of thresholds by which
-    the memory moves.
-
-    start, end: contrast in the direction of the event (end >= 0).
-    """
-    crossed = floor_divide(jnp.maximum(end, 0.0), theta)
-    rise = end - start
-    inverse = jnp.where(rise > 0, 1.0 / jnp.where(rise > 0, rise, 1.0), 0.0)
-    first = (theta - start) * inverse
-    spikes = Spikes(crossed, first, theta * inverse, None)
-    if model.refractory_s is None:
-        return spikes, crossed
-    dt = jnp.maximum(dt, 1e-9)
-    dead = model.refractory_s / dt
-    ready = dead - last / dt
-    if model.kind == "esim":
-        return thinned(spikes, ready, dead), crossed
-    spikes = delayed(spikes, ready, dead)
-    return spikes, spikes.count
-
-
-def delayed(spikes: Spikes, ready: Array, dead: Array) -> Spikes:
-    """v2e's refractory period: an event within it is delayed.
-
-    t_k = max(s_k, max(s_0, ready) + k dead): not before the crossing, and not within `dead` of the
-    event before. Contrast of events that do not fit into the interval is kept. ready: time from
-    which the pixel may fire.
-    """
-    earliest = jnp.maximum(jnp.maximum(spikes.first, 0.0), ready)
-    fits = jnp.where(earliest <= 1.0, jnp.floor((1.0 - earliest) / dead) + 1.0, 0.0)
-    return dataclasses.replace(spikes, count=jnp.minimum(spikes.count, fits), earliest=earliest)
-
-
-def thinned(spikes: Spikes, ready: Array, dead: Array) -> Spikes:
-    """ESIM's refractory period: an event within it is lost. The rest of an arithmetic progression
-    is one again: the first event after `ready`, then each first one at least `dead` later."""
-    spacing = jnp.maximum(spikes.spacing, 1e-9)
-    skipped = jnp.clip(jnp.ceil((ready - spikes.first) / spacing), 0.0, spikes.count)
-    stride = jnp.maximum(jnp.ceil(dead / spacing), 1.0)
-    left = spikes.count - skipped
-    count = jnp.where(left > 0, jnp.floor((left - 1.0) / stride) + 1.0, 0.0)
-    first = spikes.first + skipped * spikes.spacing
-    return Spikes(count, first, stride * spikes.spacing, None)
 
 
 def slot_time(k: Array, total: Array, begin: Array, end: Array) -> Array:
@@ -211,16 +138,6 @@ def slots(
     return spikes, jnp.where(checked, new_last, last)
 
 
-def since_last(model: Constants, spikes: Spikes, last: Array, dt: Array) -> Array:
-    """Seconds from the last signal event to the end of the interval (crossing times). count
-    has no sign here."""
-    k = spikes.count - 1.0
-    at = spikes.first + k * spikes.spacing
-    if spikes.earliest is not None:
-        at = jnp.maximum(at, spikes.earliest + k * (model.refractory_s / jnp.maximum(dt, 1e-9)))
-    return jnp.where(spikes.count > 0, (1.0 - at) * dt, last + dt)
-
-
 def contrast(
     model: Constants, theta_on: Array, theta_off: Array, state: PixelState, log_i: Array,
     i01: Array, leaked: Array | None, dt: Array,
@@ -236,6 +153,9 @@ def contrast(
     if leaked is not None:
         base, owed = lowered(base, owed, leaked)
     start, end = state.lp - state.base, lp - base
+    if model.is_reset:
+        start, end, anew = begun_anew(model, start, end, state.last, dt)
+        base = jnp.where(anew, lp - end, base)
     rising = end > 0
     theta = jnp.where(rising, theta_on, -theta_off)
     after = PixelState(lp, base, state.last, owed=owed)

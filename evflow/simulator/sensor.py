@@ -21,7 +21,8 @@ from evflow.errors import EvflowDataError
 from evflow.light.log_maps import LOG_MAPS, normalised_intensity
 from evflow.simulator import noise, pixel, second_order
 from evflow.simulator.constants import Constants
-from evflow.simulator.pixel import PixelState, Spikes
+from evflow.simulator.pixel import PixelState
+from evflow.simulator.spikes import Spikes, floor_divide
 
 Array = jax.Array
 LEAST_THETA = 1e-4  # log units; float32 holds the log of 255 DN to half a percent of that
@@ -224,7 +225,7 @@ def advance(
         camera.theta_on, camera.theta_off, state, log_i, i01, disturbance.leaked)
     most = jnp.zeros((), end.dtype)
     if model.timestamps == "v2e":
-        most = jnp.max(pixel.floor_divide(end, jnp.abs(theta)))
+        most = jnp.max(floor_divide(end, jnp.abs(theta)))
 
     def send(s: PixelState, th: Array, b: Array, e: Array) -> tuple[PixelState, Spikes]:
         return pixel.send(model, s, th, b, e, dt, *clock, most)

@@ -19,7 +19,7 @@ from evflow.camera.sensors import SensorModel
 from evflow.light.log_maps import LOG_MAPS, to_log
 from evflow.simulator import active, circuits, pack, simulate, simulate_stream
 from evflow.simulator.active import step_still
-from evflow.simulator.pixel import floor_divide
+from evflow.simulator.spikes import floor_divide
 from evflow.types import Events
 
 KEY = jax.random.key(0)
