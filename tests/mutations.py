@@ -32,7 +32,7 @@ class Mutation:
     tests: str
 
 
-PIXEL, NOISE = "simulator/pixel.py", "simulator/noise.py"
+PIXEL, SPIKES, NOISE = "simulator/pixel.py", "simulator/spikes.py", "simulator/noise.py"
 OBJECTIVE, STEP = "training/objective.py", "training/step.py"
 FLOW, VOXEL, SIMULATE = "tests/network/test_flow.py", "tests/test_voxel.py", "tests/simulator/"
 MUTATIONS = (
@@ -43,8 +43,11 @@ MUTATIONS = (
              f"{FLOW} -k undoes"),
     Mutation("low-pass", PIXEL, "return lp + eps * (log_i - lp)",
              "return lp + 0.95 * eps * (log_i - lp)", f"{SIMULATE}test_simulate.py -k low_pass"),
-    Mutation("refractory ignored", PIXEL, "    spikes = delayed(spikes, ready, dead)\n", "",
+    Mutation("refractory ignored", SPIKES, "    spikes = delayed(spikes, ready, dead)\n", "",
              f"{SIMULATE}test_simulate.py -k refractory"),
+    Mutation("kept in a reset", SPIKES, "return rise * jnp.maximum(1.0 - at - dead, 0.0)",
+             "return rise * jnp.maximum(1.0 - at, 0.0)",
+             f"{SIMULATE}test_dead_contrast.py -k reset_to_reset"),
     Mutation("leak's sign", PIXEL, "left = base - due", "left = base + due",
              f"{SIMULATE}test_noise.py -k leak"),
     Mutation("eta", NOISE, "on, off = camera.eta_on, camera.eta_off\n",

@@ -17,13 +17,15 @@ import numpy as np
 
 from evflow.camera.file import PARAMETERS
 from evflow.camera.prior import Summary
-from evflow.camera.sensors import LogMap, SensorModel
+from evflow.camera.sensors import DeadContrast, LogMap, SensorModel
 from evflow.errors import EvflowDataError
 from evflow.files.archives import load_npz
 
 MEASURED = ("cutoff_hz", "refractory_s", "leak_hz", "shot_hz")  # of a SensorModel, with an error
 LAW = "cutoff_by_light"  # 1 or 0
 MAP = "log_eps"  # 1: the sensor's log map is "log_eps", 0: "linlog"
+LOSS = "dead_contrast"  # index in LOSSES
+LOSSES: tuple[DeadContrast, ...] = ("keeps", "drops", "resets")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,6 +51,7 @@ def as_arrays(
     named |= {f"sensor_{name}_std": std.get(name, np.nan) for name in MEASURED}
     named[f"sensor_{LAW}"] = float(sensor.cutoff_by_light)
     named[f"sensor_{MAP}"] = float(sensor.log_map == MAP)
+    named[f"sensor_{LOSS}"] = LOSSES.index(sensor.in_dead_time)
     named |= {f"optics_{name}": value for name, value in dataclasses.asdict(optics).items()}
     return {name: np.asarray(value, np.float64) for name, value in named.items()}
 
@@ -119,7 +122,7 @@ def read_sensor(path: str | os.PathLike) -> tuple[SensorModel, Optics]:
     Raises EV009 if a value is not a finite number, EV016 if there is no file."""
     held = load_npz(Path(path))
     values: dict[str, dict[str, Any]] = {"sensor": {}, "optics": {}}
-    names = {"sensor": (*MEASURED, LAW, MAP),
+    names = {"sensor": (*MEASURED, LAW, MAP, LOSS),
              "optics": tuple(f.name for f in dataclasses.fields(Optics))}
     for room, wanted in names.items():
         for name in wanted:
@@ -134,6 +137,11 @@ def read_sensor(path: str | os.PathLike) -> tuple[SensorModel, Optics]:
     if LAW in values["sensor"]:
         values["sensor"][LAW] = bool(values["sensor"][LAW])
     log_map: LogMap = "log_eps" if values["sensor"].pop(MAP, 0.0) else "linlog"
+    if (loss := values["sensor"].pop(LOSS, 0.0)) not in range(len(LOSSES)):
+        raise EvflowDataError(
+            "EV009", f"{path}: sensor_{LOSS} is {loss:g}.", "It is "
+            f"{', '.join(f'{k} ({name})' for k, name in enumerate(LOSSES))}: evflow estimate.")
     sensor = SensorModel(
-        **values["sensor"], log_map=log_map, eta_is_all=True, noise_resets_memory=True)
+        **values["sensor"], log_map=log_map, dead_contrast=LOSSES[int(loss)] if loss else "auto",
+        eta_is_all=True, noise_resets_memory=True)
     return sensor, Optics(**values["optics"])

@@ -65,6 +65,10 @@ class Pixels:
     refractory_s: Annotated[float | None, value("SECONDS", "--refractory")] = None
     """Time after an event of light or leak during which a pixel sends no other (v2e: .0005); noise
     events ignore it."""
+    dead_contrast: Literal["auto", "keeps", "drops", "resets"] = "auto"
+    """What becomes of contrast that changes in that time. keeps: it fires later (v2e); drops:
+    events that fall into it are lost (ESIM); resets: the pixel begins anew at its end. auto: as
+    measured with --camera, else the sensor's own; clean and noisy keep it."""
     leak_hz: Annotated[float | None, value("HZ", "--leak")] = None
     """ON leak events per second and pixel, without light changes; for a measured camera they come
     on top of all its noise."""
@@ -97,7 +101,13 @@ class Pixels:
             refuse(self, CHOICES, f"--sensor {self.sensor} has no such choice")
         refuse(self, [name for name in WITHOUT[model.kind] if given.get(name)],
                f"--sensor {self.sensor} has no such part; clean, noisy and v2e do")
+        if self.dead_contrast != "auto":
+            if model.kind != "v2e" or model.timestamps != "crossing":
+                refuse(self, ("dead_contrast",), f"--sensor {self.sensor} has no such choice")
+            given["dead_contrast"] = self.dead_contrast
         model = dataclasses.replace(model, **given)
+        if not model.refractory_s:
+            refuse(self, ("dead_contrast",), "there is no dead time without --refractory-s")
         if not model.leak_hz:
             refuse(self, ("leak_jitter", "leak_fpn_decades"), "there is no leak without --leak-hz")
         if not model.cutoff_hz and self.photoreceptor == "first-order":
@@ -110,12 +120,15 @@ class Pixels:
         from evflow.camera.sensors import SecondOrder
 
         refuse(self, ("cutoff_by_light",), "a second-order photoreceptor always depends on light")
+        if self.dead_contrast != "resets":
+            refuse(self, ("dead_contrast",), "a second-order pixel begins anew after its dead time")
         if self.cutoff_hz == 0:
             raise EvflowDataError("EV020", "--photoreceptor second-order and --cutoff-hz 0.",
                                   "Give the corner frequency in the dark, or leave it out.")
         cutoff_hz = model.cutoff_hz or self._circuit()[0].cutoff_hz
         receptor = SecondOrder().at(cutoff_hz) if cutoff_hz else SecondOrder()
-        return dataclasses.replace(model, cutoff_hz=0.0, photoreceptor=receptor)
+        return dataclasses.replace(
+            model, cutoff_hz=0.0, photoreceptor=receptor, dead_contrast="auto")
 
     def seen_by(self, recorded: bool) -> Photoreceptor:
         """The measured camera's photoreceptor, unless options choose another; its light and clock

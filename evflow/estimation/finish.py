@@ -191,7 +191,9 @@ def _measured(
     found, dead = front_end.found, front_end.dead
     sensor, std = found.sensor if found else (SensorModel(noise_resets_memory=True), {})
     sensor, std = measured_noise(sensor, std, leak, shot)
-    fields = {"sensor": dataclasses.replace(sensor, refractory_s=dead.seconds),
+    law = front_end.lost.law if front_end.lost else "auto"
+    fields = {"sensor": dataclasses.replace(
+                  sensor, refractory_s=dead.seconds, dead_contrast=law),
               "sensor_std": {**std, "refractory_s": dead.std_s}}
     return {**fields, "optics": optics, "receptor": found} if found else fields
 

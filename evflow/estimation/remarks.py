@@ -114,8 +114,7 @@ def lost_notes(lost: Lost | None) -> list[Note]:
     return [Note(
         "pixels.lost", f"pixels lose contrast in their dead time of {1e3 * lost.dead_s:.1f} ms: "
         f"{how[lost.law]}. Taken as kept, the thresholds would be {on:.0f} % (ON) and {off:.0f} % "
-        "(OFF) too high. Simulations keep it (as v2e), and have more events where light changes "
-        "fast.")]
+        "(OFF) too high.")]
 
 
 def noise_notes(shot: Shot) -> list[Note]:

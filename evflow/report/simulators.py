@@ -2,7 +2,7 @@
 
 Each has its own best constants, from the first half of a recording, and is tested on the same
 frames of the second. v2e's pixel is the measured camera, pixel by pixel, with its photoreceptor;
-ESIM's has one threshold per polarity and no noise; DVS-Voltmeter's comes from
+ESIM's has one threshold per polarity, the same dead time and no noise; DVS-Voltmeter's comes from
 `baselines/voltmeter_fit.py`. All thresholds are scaled so that the first half gets as many events
 as were recorded; the camera as measured is shown too.
 """
@@ -122,13 +122,14 @@ def which_simulator(
     key, shape = jax.random.key(seed), found.n_events.shape
     seen_by, own = as_measured(found.sensor, found.optics)
 
-    def scaled(scale: Array) -> tuple[Camera, SensorModel]:
-        return dataclasses.replace(
+    def v2e(scale: Array) -> tuple[Camera, SensorModel]:
+        camera = dataclasses.replace(
             found.camera, theta_on=found.camera.theta_on * np.float32(scale[0]),
-            theta_off=found.camera.theta_off * np.float32(scale[1])), own
+            theta_off=found.camera.theta_off * np.float32(scale[1]))
+        return camera, dataclasses.replace(own, dead_contrast="keeps")
 
     def esim(theta: Array) -> tuple[Camera, SensorModel]:
-        return _even(shape, theta), SensorModel(kind="esim")
+        return _even(shape, theta), SensorModel(kind="esim", refractory_s=own.refractory_s)
 
     constants = measured_constants(data, quiet_light(recording, first, found))
 
@@ -136,14 +137,14 @@ def which_simulator(
         fitted = dataclasses.replace(constants.voltmeter, k1=1.0 / float(theta[0]))
         return _even(shape, theta), SensorModel(kind="voltmeter", voltmeter=fitted)
 
-    scale = matched(key, np.ones(2), scaled, learnt, seen_by)
+    scale = matched(key, np.ones(2), v2e, learnt, seen_by)
     theta = matched(key, regressed(data, DARKEST, tied=False)[0], esim, learnt)
     level = matched(key, np.full(2, 1.0 / constants.voltmeter.k1), voltmeter, learnt, tied=True)
     circuit = voltmeter(level)[1].voltmeter
-    rows = (("measured", scaled(np.ones(2)), seen_by, _constants(found, np.ones(2)), ()),
-            ("v2e", scaled(scale), seen_by, _constants(found, scale), ()),
-            ("esim", esim(theta), IDEAL, dict(zip(("theta_on", "theta_off"), theta, strict=True)),
-             ()),
+    rows = (("measured", (found.camera, own), seen_by, _constants(found, np.ones(2)), ()),
+            ("v2e", v2e(scale), seen_by, _constants(found, scale), ()),
+            ("esim", esim(theta), IDEAL,
+             {"theta_on": theta[0], "theta_off": theta[1], "refractory_s": own.refractory_s}, ()),
             ("voltmeter", voltmeter(level), IDEAL, dataclasses.asdict(circuit),
              constants.undetermined))
     made = []

@@ -77,11 +77,10 @@ def poorer(judged: list[Judged]) -> str:
 def judge_estimate(found: CameraEstimate, trial: Trial | None, held: Trial | None) -> list[Judged]:
     """Everything that bears on whether the camera can be simulated with."""
     judged = [_threshold(found, key) for key in ("on", "off")]
-    kept = any(note.code == "pixels.lost" for note in found.notes)
     for test, where in ((trial, "re-simulated"), (held, "held out")):
         if test:
             judged += [j for key in ("on", "off") for j in judge_stream(
-                test.numbers, key, where, test.ceiling, _lost(test), kept)]
+                test.numbers, key, where, test.ceiling, _lost(test))]
     return judged + _pixels(found)
 
 
@@ -123,11 +122,11 @@ def _lost(test: Trial) -> bool:
 
 def judge_stream(
     numbers: dict[str, Any], key: str, where: str,
-    ceiling: dict[str, float | None] | None = None, lost: bool = False, kept: bool = False,
+    ceiling: dict[str, float | None] | None = None, lost: bool = False,
 ) -> list[Judged]:
     """One polarity of a synthetic stream: how many events, and in which pixels. ceiling: r of two
     re-simulations, which r is held against; without it, 1; lost: the motion between the frames
-    was; kept: the simulation keeps contrast that the camera's pixels lose in their dead time."""
+    was."""
     name, matter = key.upper(), f"rate {where} / recorded"
     ratio = numbers["rate_hz"]["ratio"][key]
     if not any(numbers["rate_hz"][side][key] for side in ("real", "synthetic")):
@@ -142,8 +141,7 @@ def judge_stream(
         grade, name, float(np.log(factor) / np.log(RATE[0])),
         f"{name} has {ratio:.2f} times the recorded rate ({where}).", matter, f"{ratio:.2f} ×",
         "" if grade == "good" else _rate_advice(
-            ratio, _whose(numbers, name), tested=ceiling is not None, lost=lost,
-            kept=kept))]
+            ratio, _whose(numbers, name), tested=ceiling is not None, lost=lost))]
     r, best = numbers["counts"]["r"][key], ceiling[key] if ceiling else 1.0
     if r is not None and best is not None and best > 0:
         lost = 1 - r / best
@@ -165,14 +163,11 @@ def _whose(numbers: dict[str, Any], name: str) -> str:
 
 
 def _rate_advice(
-    ratio: float, whose: str, *, tested: bool, lost: bool, kept: bool = False
+    ratio: float, whose: str, *, tested: bool, lost: bool
 ) -> str:
     """whose: "ON ", "OFF ", or "" for both; tested: the stream is of an estimate on its own
-    recording; lost, kept: as of `judge_stream`."""
+    recording; lost: as of `judge_stream`."""
     seen = f"Too {'many' if ratio > 1 else 'few'}"
-    if kept and ratio > 1:
-        return (f"{seen} {whose}events are simulated: this camera's pixels lose contrast in their "
-                "dead time, and simulations keep it. The thresholds allow for that.")
     if tested and lost:
         return (f"{seen} {whose}events are simulated, and between some frames the motion is lost "
                 "(see the event rate over time): slower motion, or a higher frame rate, comes "

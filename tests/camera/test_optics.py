@@ -36,6 +36,22 @@ def test_it_is_read_as_it_was_written(
     assert float(np.load(path)["sensor_cutoff_hz_std"]) == 30.0
 
 
+@pytest.mark.parametrize("law", ["keeps", "drops", "resets"])
+def test_what_becomes_of_contrast_in_the_dead_time_is_read_as_written(
+    law: Literal["keeps", "drops", "resets"], tmp_path: Path
+) -> None:
+    path, sensor = tmp_path / "camera.npz", SensorModel(refractory_s=2e-3, dead_contrast=law)
+    Camera.constant((4, 5)).save(path, **as_arrays(sensor, {}, Optics()))
+    assert read_sensor(path)[0].in_dead_time == law
+
+
+@pytest.mark.parametrize("number", [3.0, -1.0, 0.5])
+def test_an_unknown_loss_of_contrast_is_refused(number: float, tmp_path: Path) -> None:
+    Camera.constant((4, 5)).save(tmp_path / "camera.npz", sensor_dead_contrast=np.float64(number))
+    with pytest.raises(EvflowDataError, match=r"EV009.*sensor_dead_contrast is .*resets"):
+        read_sensor(tmp_path / "camera.npz")
+
+
 def test_a_camera_without_any_has_an_ideal_pixel(tmp_path: Path) -> None:
     Camera.constant((4, 5)).save(tmp_path / "camera.npz")
     sensor, optics = read_sensor(tmp_path / "camera.npz")

@@ -17,11 +17,12 @@ from helpers.videos import drifting
 
 from evflow import Camera, read_events, read_recording, simulate
 from evflow.camera import Summary
-from evflow.camera.optics import summary_arrays
-from evflow.camera.sensors import SENSORS, SecondOrder
+from evflow.camera.optics import Optics, as_arrays, summary_arrays
+from evflow.camera.sensors import SENSORS, SecondOrder, SensorModel
 from evflow.cli import main
 from evflow.commands.pixels import Pixels
 from evflow.commands.simulate import Simulate
+from evflow.errors import EvflowDataError
 from evflow.io.source import open_frames
 from evflow.simulator.constants import Constants
 from evflow.simulator.sensor import start
@@ -90,6 +91,25 @@ def test_the_circuit_from_the_command_line() -> None:
         for other in set(told) - {name}:
             assert getattr(model, other) == getattr(SENSORS["noisy"].model, other)
     assert Pixels().model().cutoff_hz == 0
+
+
+def test_what_becomes_of_contrast_in_the_dead_time(tmp_path: Path) -> None:
+    """As told, else as the camera was measured, else the sensor's own."""
+    dead = {"refractory_s": 0.002}
+    for options, law in (({}, "keeps"), ({"dead_contrast": "drops"}, "drops"),
+                         ({"photoreceptor": "second-order"}, "resets"),
+                         ({"sensor": "esim"}, "drops")):
+        assert Pixels(**dead, **options).model().in_dead_time == law
+    path = tmp_path / "camera.npz"
+    measured = SensorModel(refractory_s=1e-3, cutoff_hz=90.0, dead_contrast="resets")
+    Camera.constant((4, 5)).save(path, **as_arrays(measured, {}, Optics()))
+    assert Pixels(camera=path).model().in_dead_time == "resets"
+    assert Pixels(camera=path, dead_contrast="keeps").model().in_dead_time == "keeps"
+    assert Pixels(camera=path, photoreceptor="second-order").model().in_dead_time == "resets"
+    for wrong in ({"dead_contrast": "drops"}, {**dead, "dead_contrast": "keeps", "sensor": "esim"},
+                  {**dead, "dead_contrast": "keeps", "photoreceptor": "second-order"}):
+        with pytest.raises(EvflowDataError, match=r"EV020.*--dead-contrast"):
+            Pixels(**wrong).model()
 
 
 def test_a_photoreceptor_of_second_order_has_the_corner_of_the_first() -> None:
