@@ -66,6 +66,18 @@ def test_what_dead_time_and_shot_noise_lose_is_told(to: str) -> None:
     assert ("1.500 Hz in the dark" in told[1] and "light is\n  lost" in told[1]) == (to != "v2e")
 
 
+@pytest.mark.parametrize("to", list(TARGETS))
+def test_how_a_dead_time_differs_from_the_camera_is_told(to: str) -> None:
+    """Of a camera that keeps contrast in it, drops its events, or begins anew at its end."""
+    for law, lost in (("keeps", "keep it for later"), ("drops", "as by this camera's"),
+                      ("resets", "begin anew")):
+        sensor = SensorModel(refractory_s=1e-3, dead_contrast=law)
+        told = export_camera(Camera.constant((4, 6)), to, sensor=sensor)[0].text
+        kept = "dead time is kept for later" in told
+        assert kept == (to == "v2e" and law != "keeps")
+        assert (lost in told) == (to != "v2e")
+
+
 @pytest.mark.parametrize("to", ["v2e", "esim", "openeb", "iebcs"])
 def test_export_has_maps_scripts_and_words(
     tmp_path: Path, camera: Path, capsys: pytest.CaptureFixture[str], to: str

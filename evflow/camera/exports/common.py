@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from evflow.camera.leak import without_leak
-from evflow.camera.sensors import SensorModel
+from evflow.camera.sensors import DeadContrast, SensorModel
 
 Maps = Mapping[str, np.ndarray]
 PACE = (128 + 20) / 275  # cutoff at 128 DN over that at 255 DN, for a low-pass that follows light
@@ -26,8 +26,17 @@ SRGB = '''The script undoes the sRGB of the video, as evflow simulate does; with
 as the last word it takes the video's bytes as light.
 '''
 
-DEAD = '''- Contrast that changes within the dead time is lost; the pixels of v2e and
-  evflow keep it for later. At 1 ms that took a sixth to a fifth of one video's events.
+LOSES: Mapping[str, str] = {  # programs whose pixels drop events; by SensorModel.dead_contrast
+    "keeps": '''- Contrast that changes within the dead time is lost; the pixels of v2e and
+  of this camera keep it for later. At 1 ms that took a sixth to a fifth of one video's events.
+''',
+    "drops": '''- Events that fall into the dead time are dropped, as by this camera's pixels.
+''',
+    "resets": '''- Events that fall into the dead time are dropped. This camera's pixels begin anew
+  at its end, and send fewer where light changes fast.
+'''}
+KEEPS = '''- Contrast that changes within the dead time is kept for later; this camera's pixels lose
+  it. Where light changes fast, there are more events (1.1 to 1.5 times, with 2 and 5 ms).
 '''
 
 # of an image read from the first argument
@@ -84,6 +93,7 @@ class Settings:
     leak_hz: float = 0.0
     shot_hz: float = 0.0
     log_eps: bool = False
+    dead_contrast: DeadContrast = "keeps"
 
     @staticmethod
     def of(
@@ -107,7 +117,7 @@ class Settings:
         values = {**middle, **sigma, **cutoff, **(summary or {})}
         return Settings(width, height, **values, dead_s=sensor.refractory_s,
                         leak_hz=sensor.leak_hz, shot_hz=sensor.shot_hz,
-                        log_eps=sensor.log_map == "log_eps")
+                        log_eps=sensor.log_map == "log_eps", dead_contrast=sensor.in_dead_time)
 
     @property
     def leak_seen(self) -> float:
@@ -124,6 +134,16 @@ class Settings:
         dead = f"dead time {1e3 * self.dead_s:.2f} ms" if self.dead_s else "no dead time"
         leak = f", leak {self.leak_hz:.3f} Hz (part of the ON noise)" if self.leak_hz else ""
         return f"{cutoff}, {dead}{leak}"
+
+    @property
+    def dropped(self) -> str:
+        """An entry on the dead time for a program whose pixels drop the events in it."""
+        return LOSES[self.dead_contrast]
+
+    @property
+    def kept(self) -> str:
+        """The same for a program whose pixels keep the contrast; "" if the camera's do."""
+        return "" if self.dead_contrast == "keeps" else KEEPS
 
     @property
     def light_lost(self) -> str:

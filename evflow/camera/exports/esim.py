@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from evflow.camera.exports.common import DEAD, LIGHT, NOISE, Export, Maps, Settings
+from evflow.camera.exports.common import LIGHT, NOISE, Export, Maps, Settings
 
 SCRIPT = '''"""Images through esim_py with the nearest scalars, and the measured noise added.
 
@@ -99,7 +99,7 @@ LOG = '''- The log map: ESIM uses log(I / 255 + eps), {refers_to}.
 
 def export(maps: Maps, s: Settings) -> Export:
     """The medians, and a script that adds the noise."""
-    values = vars(s) | {"circuit": s.circuit, "dead": DEAD, "light_lost": s.light_lost,
+    values = vars(s) | {"circuit": s.circuit, "dead": s.dropped, "light_lost": s.light_lost,
                         "dead_ns": round(s.dead_s * 1e9),
                         "same_size": s.same_size,
                         "log": "" if s.log_eps else LOG.format(refers_to=s.refers_to)}

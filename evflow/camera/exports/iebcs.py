@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from evflow.camera.exports.common import DEAD, LIGHT, SRGB, SWITCH, Export, Maps, Settings
+from evflow.camera.exports.common import LIGHT, SRGB, SWITCH, Export, Maps, Settings
 
 USUAL_DEAD_US = 100  # in IEBCS's examples
 FREQUENCIES = np.concatenate([np.arange(1, 10) * 10.0**k for k in range(-3, 5)])
@@ -85,7 +85,7 @@ def export(maps: Maps, s: Settings) -> Export:
     rates = {"bgnp": max(s.eta_on, slowest), "bgnn": max(s.eta_off, slowest)}
     values = vars(s) | rates | {
         "light": LIGHT + SWITCH, "srgb": SRGB, "same_size": s.same_size, "sigma": s.sigma,
-        "refers_to": s.refers_to, "circuit": s.circuit, "dead": DEAD,
+        "refers_to": s.refers_to, "circuit": s.circuit, "dead": s.dropped,
         "light_lost": s.light_lost,
         "dead_us": round(s.dead_s * 1e6) or USUAL_DEAD_US}
     arrays = {"noise_pos.npy": spectrum(maps["eta_on"]), "noise_neg.npy": spectrum(maps["eta_off"])}

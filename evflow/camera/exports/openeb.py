@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from evflow.camera.exports.common import DEAD, LIGHT, NOISE, SRGB, SWITCH, Export, Maps, Settings
+from evflow.camera.exports.common import LIGHT, NOISE, SRGB, SWITCH, Export, Maps, Settings
 
 LOW, HIGH = 0.01, 1.0  # where OpenEB clips thresholds
 
@@ -74,7 +74,7 @@ def export(maps: Maps, s: Settings) -> Export:
     outside = sum(int(((theta < LOW) | (theta > HIGH)).sum()) for theta in thetas)
     clipped = f"; {outside:,} of the measured ones are" if outside else ""
     values = vars(s) | {
-        "circuit": s.circuit, "dead": DEAD,
+        "circuit": s.circuit, "dead": s.dropped,
         "light_lost": s.light_lost, "dead_us": round(s.dead_s * 1e6), "sigma": s.sigma,
         "clipped": clipped, "light": LIGHT + SWITCH, "srgb": SRGB,
         "same_size": s.same_size, "refers_to": s.refers_to}

@@ -71,7 +71,8 @@ What v2e cannot represent
 - A noise event stores the present intensity in the pixel's memory.
 - Its circuit is the measured one ({circuit}), if the frames come at several times the cutoff: its
   low-pass is exact for short steps only, and its dead time delays events by whole frames.
-{log}- All events of a pixel between two frames share v2e's time slots; times are float32 seconds.
+{log}{kept}- All events of a pixel between two frames share v2e's time slots; times are float32
+  seconds.
 '''
 
 LOG = """- Its logarithm is linear below 20 DN, with up to three times the contrast; the measured
@@ -112,7 +113,7 @@ def export(maps: Maps, s: Settings) -> Export:
         "circuit": s.circuit, "sigma": s.sigma, "command": command, "right": right,
         "share": f"{gain * GREY:.3f} times that" if s.shot_hz else "that",
         "apart": f", ON without {s.leak_seen:.4f} Hz of leak" if s.leak_hz else "",
-        "srgb": SRGB, "log": LOG if s.log_eps else ""}
+        "srgb": SRGB, "log": LOG if s.log_eps else "", "kept": s.kept}
     source = SCRIPT.format(**vars(s) | {
         "gain": gain, "leak_seen": s.leak_seen, "light": LIGHT + SWITCH,
         "same_size": s.same_size})

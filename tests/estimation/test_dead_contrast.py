@@ -1,0 +1,37 @@
+"""An estimate of cameras whose pixels keep, drop or lose to a reset what changes in their dead
+time, and a simulation of the camera that it saved."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from helpers.films import DEAD_S, FRAME_S, SUB, dead_events, film, integrated
+
+from evflow import Camera, Recording, estimate_camera, simulate
+from evflow.camera.optics import read_sensor
+from evflow.estimation.refine.path import STEPS
+
+
+@pytest.mark.parametrize("law", ["keeps", "drops", "resets"])
+def test_a_camera_is_measured_and_simulated_as_its_pixels_are(law: str, tmp_path: Path) -> None:
+    dn, dt_s = film(), FRAME_S / STEPS
+    events = dead_events(integrated(dn, dt_s, 0.0, 0.0, SUB), dt_s / SUB, law)
+    frames = np.rint(dn[::STEPS]).astype(np.uint8)
+    times = np.round(1e6 * FRAME_S * np.arange(len(frames))).astype(np.int64) + 10_000
+    found = estimate_camera(Recording(events, frames, times))
+    assert found.sensor.in_dead_time == law
+    assert ("pixels.lost" in [n.code for n in found.notes]) == (law != "keeps")
+    theta = [float(found.summary.theta_on), float(found.summary.theta_off)]
+    np.testing.assert_allclose(theta, [0.25, 0.2], rtol=0.1)
+    found.save(tmp_path / "camera.npz")
+    sensor, _ = read_sensor(tmp_path / "camera.npz")
+    assert sensor.in_dead_time == law
+    if law != "keeps":
+        assert sensor.refractory_s == pytest.approx(DEAD_S, rel=0.12)
+    shown = np.arange(len(dn)) * 1e6 * dt_s + 10_000
+    ours = simulate(jax.random.key(0), dn.astype(np.float32), np.round(shown).astype(np.int64),
+                    Camera.constant(dn.shape[1:], *theta), model=sensor, full_scale=255)
+    assert len(ours) == pytest.approx(len(events), rel=0.12)
