@@ -133,7 +133,8 @@ def estimate(
         camera, error = maps.by_flow(state.params, again, summary, std)
     camera, error, summary, std = maps.with_rates(camera, error, sent, hot, summary, std)
     if lost := front_end.lost:
-        camera, error, summary, std = maps.with_contrast_lost(camera, error, summary, std, lost)
+        camera, error, summary, std = maps.with_contrast_lost(
+            camera, error, summary, std, lost, lacking)
     extent = extent or EVERYTHING
     thirds = drift.thirds(state.parts, lost.excess if lost else 1.0)
     return CameraEstimate(

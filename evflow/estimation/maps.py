@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import jax
@@ -112,25 +112,36 @@ def with_unquiet_error(
 
 
 def with_contrast_lost(
-    camera: Camera, std: Camera, summary: Summary, summary_std: Summary, lost: Lost
+    camera: Camera, std: Camera, summary: Summary, summary_std: Summary, lost: Lost,
+    lacking: Sequence[str],
 ) -> tuple[Camera, Camera, Summary, Summary]:
     """The maps and the summary, and their errors, with thresholds of pixels that lose contrast in
-    their dead time: all above took it as kept."""
+    their dead time: all above took it as kept. lacking: polarities whose thresholds are the
+    prior's, and stay so."""
     for p, name in enumerate(("on", "off")):
+        if name in lacking:
+            continue
         theta, sigma = f"theta_{name}", f"sigma_{name}"
-        camera, std = _lowered(camera, std, theta, lost, p)
-        for what in (theta, sigma):
-            summary, summary_std = _lowered(summary, summary_std, what, lost, p)
+        taken, error = (float(getattr(s, theta)) for s in (summary, summary_std))
+        value, new_error = lost.corrected(p, taken, error)
+        by = np.float32(taken / value)
+        # What pixels share, relative: it is in the errors of the maps already, as it was.
+        added = np.float32(np.sqrt(np.maximum((new_error / value) ** 2 - (error / taken) ** 2, 0)))
+        camera, std = _divided(camera, std, theta, by, added)
+        summary, summary_std = _divided(summary, summary_std, sigma, by, added)
+        summary = dataclasses.replace(summary, **{theta: jnp.float32(value)})
+        summary_std = dataclasses.replace(summary_std, **{theta: jnp.float32(new_error)})
     return camera, std, summary, summary_std
 
 
-def _lowered(values: Any, errors: Any, name: str, lost: Lost, polarity: int) -> tuple[Any, Any]:
-    """A camera or a summary, and its errors, with the field `name` divided by the excess."""
-    by = np.float32(lost.excess[polarity])
+def _divided(
+    values: Any, errors: Any, name: str, by: np.float32, added: np.float32
+) -> tuple[Any, Any]:
+    """A camera or a summary, and its errors, with the field `name` divided. added: relative
+    error."""
     value, error = (getattr(s, name) / by for s in (values, errors))
-    error = jnp.hypot(error, np.float32(lost.error(polarity)) * value)
     return (dataclasses.replace(values, **{name: value}),
-            dataclasses.replace(errors, **{name: error}))
+            dataclasses.replace(errors, **{name: jnp.hypot(error, added * value)}))
 
 
 def refined(

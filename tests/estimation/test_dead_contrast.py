@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from helpers.films import DEAD_S, FRAME_S, SUB, dead_events, film, integrated
+from helpers.films import DEAD_S, FRAME_S, SUB, dead_events, integrated, view
 
 from evflow import Camera, Recording, estimate_camera, simulate
 from evflow.camera.optics import read_sensor
@@ -17,7 +17,7 @@ from evflow.estimation.refine.path import STEPS
 
 @pytest.mark.parametrize("law", ["keeps", "drops", "resets"])
 def test_a_camera_is_measured_and_simulated_as_its_pixels_are(law: str, tmp_path: Path) -> None:
-    dn, dt_s = film(), FRAME_S / STEPS
+    dn, dt_s = view(1), FRAME_S / STEPS
     events = dead_events(integrated(dn, dt_s, 0.0, 0.0, SUB), dt_s / SUB, law)
     frames = np.rint(dn[::STEPS]).astype(np.uint8)
     times = np.round(1e6 * FRAME_S * np.arange(len(frames))).astype(np.int64) + 10_000

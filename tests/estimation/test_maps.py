@@ -67,18 +67,39 @@ def test_all_but_the_thresholds_are_left() -> None:
     assert same == SUMMARY
 
 
+def lost_by_reset(on: float) -> Lost:
+    """SUMMARY's thresholds, too high by 1.25 (ON) and right (OFF); a regression that says `on`."""
+    return Lost("resets", 2e-3, 1e-4, np.array([1.25, 1.0]), np.array([on, 0.25]))
+
+
 def test_thresholds_of_pixels_that_lose_contrast_are_lowered_and_their_errors_grow() -> None:
     maps, errors = (Camera(*(np.full((2, 3), v, np.float32) for v in values))
                     for values in ((0.2, 0.25, 0.1, 0.1), (0.02, 0.02, 0.03, 0.03)))
-    lost = Lost("resets", 2e-3, 1e-4, np.array([1.25, 1.0]))
-    camera, std, summary, summary_std = with_contrast_lost(maps, errors, SUMMARY, STD, lost)
-    for values, wider, before in ((camera, std, errors), (summary, summary_std, STD)):
+    camera, std, summary, summary_std = with_contrast_lost(
+        maps, errors, SUMMARY, STD, lost_by_reset(0.16), ())
+    for values in (camera, summary):
         np.testing.assert_allclose(values.theta_on, 0.16, rtol=1e-6)
         np.testing.assert_allclose(values.theta_off, 0.25, rtol=1e-6)
-        share = lost.error(0)
-        np.testing.assert_allclose(
-            wider.theta_on, np.hypot(np.asarray(before.theta_on) / 1.25, share * 0.16), rtol=1e-6)
-        np.testing.assert_allclose(wider.theta_off, before.theta_off, rtol=1e-6)
         np.testing.assert_array_equal(values.eta_on, np.float32(0.1))
+    assert 0.16 * 0.045 < float(summary_std.theta_on) < 0.16 * 0.06  # neither of the two alone
+    added = (float(summary_std.theta_on) / 0.16) ** 2 - (float(STD.theta_on) / 0.2) ** 2
+    np.testing.assert_allclose(std.theta_on, 0.16 * np.sqrt(0.01 + max(added, 0.0)), rtol=1e-5)
+    np.testing.assert_allclose(std.theta_off, 0.02, rtol=1e-6)
     assert float(summary.sigma_on) == pytest.approx(0.03 / 1.25)
     assert float(summary.sigma_off) == pytest.approx(0.03)
+
+
+def test_where_counts_and_regression_disagree_about_a_loss_both_count_and_errors_grow() -> None:
+    apart, alike = (lost_by_reset(on).corrected(0, 0.2, 0.002) for on in (0.1, 0.16))
+    assert 0.11 < apart[0] < 0.15
+    assert apart[1] > 3 * alike[1]
+    assert lost_by_reset(0.1).corrected(0, 0.2, np.nan)[0] < 0.16
+    assert np.isnan(lost_by_reset(0.1).corrected(0, 0.2, np.nan)[1])
+
+
+def test_a_threshold_of_the_prior_is_not_corrected() -> None:
+    maps = Camera(*(np.full((2, 3), v, np.float32) for v in (0.2, 0.25, 0.1, 0.1)))
+    camera, std, summary, summary_std = with_contrast_lost(
+        maps, maps, SUMMARY, STD, lost_by_reset(0.1), ("on", "off"))
+    assert (summary, summary_std) == (SUMMARY, STD)
+    assert camera is std is maps

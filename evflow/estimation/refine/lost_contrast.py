@@ -33,22 +33,36 @@ COARSE, FINE = (0.25, 0.5, 0.75, 1.0), np.arange(-0.2, 0.21, 0.05)
 NEGLIGIBLE = 0.02  # log units of a threshold, less than what is known of it
 LEAST = 1e-3  # log units, of a threshold
 ROUNDS = 3  # of thresholds and whole events lost, each from the other
-SHARE_ERROR = 0.3  # of the correction, in logarithms: of 17 cameras one scene alone was farther off
+# Of 25 cameras, in logarithms: error of the correction by its size, and of the regression itself,
+# whose path is smoother than the light. Each is far off in other scenes than the other.
+SHARE_ERROR, OWN_ERROR = 0.4, 0.06
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Lost:
     """law: how the contrast is lost; dead_s: the dead time in seconds, and std_s its error; excess:
-    (2,) factors by which theta_on and theta_off come out too high if it is taken as kept."""
+    (2,) factors by which theta_on and theta_off come out too high if it is taken as kept; theta:
+    (2,) of the regression without that contrast."""
 
     law: Law
     dead_s: float
     std_s: float
     excess: Array
+    theta: Array
 
-    def error(self, polarity: int) -> float:
-        """Relative error of a threshold that is divided by its excess."""
-        return SHARE_ERROR * abs(float(np.log(self.excess[polarity])))
+    def corrected(self, polarity: int, theta: float, std: float) -> tuple[float, float]:
+        """A threshold that took contrast as kept, and its std, as they are: the mean, weighted by
+        precision, of that divided by its excess, and of the regression's own. Where both disagree
+        by more than their errors, these are taken as too small."""
+        excess = float(self.excess[polarity])
+        divided, own = np.log(theta / excess), np.log(float(self.theta[polarity]))
+        stated = std / theta if np.isfinite(std) else OWN_ERROR  # not all weights state one
+        variance, own_variance = stated**2 + (SHARE_ERROR * np.log(excess)) ** 2, OWN_ERROR**2
+        both = variance + own_variance
+        value = float(np.exp((own_variance * divided + variance * own) / both))
+        apart = max(1.0, float(divided - own) ** 2 / both)
+        error = value * float(np.sqrt(apart * variance * own_variance / both))
+        return value, error if np.isfinite(std) else std
 
 
 def lost_contrast(
@@ -81,13 +95,14 @@ def lost_contrast(
     before, after = (1.0 - f.explained[int(f.needed)] for f in (found, again))
     if size * np.log(before / after) < CLEARLY:
         return found, None
-    excess = np.divide(*(_solved(some, again.used)[0] for some in (data, best.data)))
+    taken_as_kept, theta = (_solved(some, again.used)[0] for some in (data, best.data))
+    excess = taken_as_kept / theta
     if np.abs(np.log(excess)).max() < NEGLIGIBLE:
         return found, None
     error = float(FINE[1] - FINE[0]) if best.law == "resets" else 0.02
     return (dataclasses.replace(again, theta=again.theta * excess,
                                 ideal_theta=again.ideal_theta * excess),
-            Lost(best.law, best.dead_s, error * shortest_s, excess))
+            Lost(best.law, best.dead_s, error * shortest_s, excess, theta))
 
 
 class Way(NamedTuple):
