@@ -32,6 +32,7 @@ CLEARLY = 6.0  # log odds required against a pixel that keeps its contrast
 COARSE, FINE = (0.25, 0.5, 0.75, 1.0), np.arange(-0.2, 0.21, 0.05)
 NEGLIGIBLE = 0.02  # log units of a threshold, less than what is known of it
 LEAST = 1e-3  # log units, of a threshold
+WAITED, HARDLY = 1.05, 1e-4  # of the dead time; of a weight
 ROUNDS = 3  # of thresholds and whole events lost, each from the other
 # Of 25 cameras, in logarithms: error of the correction by its size, and of the regression itself,
 # whose path is smoother than the light. Each is far off in other scenes than the other.
@@ -63,6 +64,19 @@ class Lost:
         apart = max(1.0, float(divided - own) ** 2 / both)
         error = value * float(np.sqrt(apart * variance * own_variance / both))
         return value, error if np.isfinite(std) else std
+
+
+def without_waiting(data: Sample, dead_s: float) -> Sample:
+    """The sample with hardly any weight of events as soon after the pixel's last as its dead time
+    allows: v2e's pixel sends them late, when its light has gone on. They still count as sent."""
+    weight = np.array(data.weight)
+    for c, dt_s in enumerate(np.asarray(data.dt_s)):
+        used = np.flatnonzero(weight[c] > 0)
+        pixel, at = (np.asarray(v)[c, used] for v in (data.pixel, data.at))
+        after = np.diff(at, prepend=-np.inf) * dt_s.mean()
+        waited = (np.diff(pixel, prepend=-1) == 0) & (after < WAITED * dead_s)
+        weight[c, used[waited]] *= HARDLY
+    return data._replace(weight=jnp.asarray(weight))
 
 
 def lost_contrast(

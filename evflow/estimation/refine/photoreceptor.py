@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from evflow.estimation.refine.lost_contrast import Lost, lost_contrast
+from evflow.estimation.refine.lost_contrast import Lost, lost_contrast, without_waiting
 from evflow.estimation.refine.path import STEPS, Films, Place, as_seen, interpolated, of_place
 from evflow.estimation.refine.readouts import without_readouts
 from evflow.estimation.refine.receptor_data import Part, Sample, sample
@@ -76,6 +76,8 @@ def find_photoreceptor(
         The photoreceptor, None with too few events; and what is lost, None if it is kept.
     """
     data = receptor_sample(places, noise_dn, films)
+    if data is not None and sharp:
+        data = without_waiting(data, shortest_s)
     found = find(data) if data is not None else None
     if data is None or found is None or not shortest_s:
         return found, None

@@ -18,10 +18,11 @@ from helpers.films import (
     integrated,
     lin_log,
     log_eps,
+    view,
 )
 
 from evflow.estimation.refine import receptor_search
-from evflow.estimation.refine.lost_contrast import lost_contrast
+from evflow.estimation.refine.lost_contrast import lost_contrast, without_waiting
 from evflow.estimation.refine.path import STEPS
 from evflow.estimation.refine.receptor_data import Sample, sample
 from evflow.estimation.refine.receptor_prior import FEW, FEWER, small_sample_odds
@@ -101,7 +102,7 @@ def sample_of(dn: np.ndarray, events: Events) -> Sample:
     times = 10_000 + np.round(np.arange(INTERVALS + 1) * FRAME_S * 1e6).astype(np.int64)
     s = sight(events, times, lin_log(dn).astype(np.float32), STEPS)
     steps_s = np.full(INTERVALS * STEPS, FRAME_S / STEPS)
-    data = sample([(dn.astype(np.float32), steps_s, s, no_readouts(s), NONE_HOT)])
+    data = sample([(dn.astype(np.float32), steps_s, s, no_readouts(s), np.zeros(dn[0].size, bool))])
     assert data is not None
     return data
 
@@ -279,3 +280,16 @@ def test_contrast_lost_in_dead_times_is_told_from_contrast_kept(law: str) -> Non
     if lost:
         assert lost.dead_s == pytest.approx(DEAD_S, rel=0.12)
         assert min(lost.excess) > 1.1
+
+
+def test_events_that_waited_for_their_dead_time_do_not_count_as_crossings() -> None:
+    """Their light has gone on: it looks like a slow photoreceptor, and like frames with a delay."""
+    dn, dt_s = view(), FRAME_S / STEPS
+    data = sample_of(dn, dead_events(integrated(dn, dt_s, 0.0, 0.0, SUB), dt_s / SUB, "keeps"))
+    before, after = find(data), find(without_waiting(data, DEAD_S))
+    assert before.seen.cutoff_hz > 0
+    assert before.seen.delay_s < -2e-3
+    assert after.used.cutoff_hz == 0
+    assert abs(after.used.delay_s) < 5e-4
+    assert after.explained[0] > max(before.explained) + 0.02
+    np.testing.assert_allclose(after.theta, [0.25, 0.2], rtol=0.05)
