@@ -22,6 +22,8 @@ STEP = 1.03  # ratio of successive candidates
 ABOVE, BELOW = (1.0, 1.1), (0.8, 0.95)  # relative ranges with many, few intervals
 ENOUGH = 200  # intervals just above
 SHARP = 8.0  # ratio of densities above and below; a slow pixel's only double over this distance
+PILED = 0.03  # relative spread at the edge of events that waited for a dead time, as v2e's do
+TILES, LEFT_OUT = 8, 16  # tiles a side, and those with most intervals at the edge
 PIXELS = 20  # with intervals at the edge: a hot pixel may fire as regularly as a clock
 LATTICE = 20  # distinct intervals within an octave: coarse times have an edge at each step
 SHORTEST = 0.01  # share of the intervals
@@ -54,12 +56,7 @@ def dead_time(events: Events) -> DeadTime:
     unknown = DeadTime(shortest_s=1e-6 * float(np.quantile(intervals, SHORTEST)))
     edges = SHORTEST_US * STEP ** np.arange(int(np.log(LONGEST_US / SHORTEST_US) / np.log(STEP)))
 
-    def between(low: float, high: float) -> np.ndarray:
-        return np.diff(np.searchsorted(intervals, [edges * low, edges * high]), axis=0)[0]
-
-    many, few = between(*ABOVE), between(*BELOW)
-    density = (ABOVE[1] - ABOVE[0]) / (BELOW[1] - BELOW[0])
-    sharpness = many / (few * density + 1.0) * (many >= ENOUGH)
+    sharpness = _sharpness(intervals, edges, ENOUGH)
     best = int(np.argmax(sharpness))
     if sharpness[best] < SHARP:
         return unknown
@@ -71,8 +68,30 @@ def dead_time(events: Events) -> DeadTime:
     if len(np.unique(octave)) < LATTICE or shorter > FEW_SHORTER or few_pixels:
         return unknown
     low, middle = np.quantile(near, [0.05, 0.5])
+    if middle - low > PILED * low:
+        elsewhere = _elsewhere(pixel, at_edge, events.size)
+        if _sharpness(intervals[elsewhere], edges[best:best + 1], ENOUGH // 4)[0] < SHARP:
+            return unknown
     seconds, std_s = float(low) * 1e-6, float(max(middle - low, 0.02 * low)) * 1e-6
     return DeadTime(seconds, std_s, shortest_s=seconds)
+
+
+def _sharpness(intervals: np.ndarray, edges: np.ndarray, enough: int) -> np.ndarray:
+    """Ratio of the densities of the sorted intervals above and below each of the edges; 0 with
+    fewer than `enough` above."""
+    many, few = (np.diff(np.searchsorted(intervals, [edges * low, edges * high]), axis=0)[0]
+                 for low, high in (ABOVE, BELOW))
+    density = (ABOVE[1] - ABOVE[0]) / (BELOW[1] - BELOW[0])
+    return many / (few * density + 1.0) * (many >= enough)
+
+
+def _elsewhere(pixel: np.ndarray, at_edge: slice, size: tuple[int, int]) -> np.ndarray:
+    """(N,) bool: intervals outside the tiles with most of those at the edge. The edge of a
+    blinking lamp's light has one too, but in its place only."""
+    (width, height), y = size, pixel // size[0]
+    tile = y * TILES // height * TILES + pixel % width * TILES // width
+    most = np.argsort(np.bincount(tile[at_edge], minlength=TILES**2))[-LEFT_OUT:]
+    return ~np.isin(tile, most)
 
 
 def own_intervals(events: Events) -> tuple[np.ndarray, np.ndarray]:
