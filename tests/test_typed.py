@@ -95,6 +95,8 @@ TYPES = {
                 "pixels_active: Array, exposure: Array, events_on: Array, events_off: Array) "
                 "-> Stats",
     "ef.finish(params, stats)": "tuple[Summary, Summary]",
+    "ef.finish(params, sum(ef.summarize(params, v, d) for v, d in [(voxels, dlogI)]))":
+        "tuple[Summary, Summary]",
     "ef.Summary(*6 * (jax.numpy.zeros(()),)).sigma_on": "Array",
     "code": "Code",
     "ef.Code(code.changes, code.summary, code.context).summary": "Summary",

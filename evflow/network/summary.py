@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Literal
 
 import jax
 from jax.typing import ArrayLike
@@ -74,12 +75,12 @@ def _pool(
     return pooling.pool(config, net, voxels, dlogI, window_s, intensity, at_a_time=at_a_time)
 
 
-def finish(params: Params, stats: Stats) -> tuple[Summary, Summary]:
+def finish(params: Params, stats: Stats | Literal[0]) -> tuple[Summary, Summary]:
     """The camera's summary from pooled statistics.
 
     Args:
         params: of `load_weights`.
-        stats: of `summarize`, one or a sum.
+        stats: of `summarize`, one or a sum (its type includes the 0 that `sum` begins with).
 
     Returns:
         The summary and its standard deviation, (...,) each, in natural units (natural log, Hz);
@@ -87,9 +88,12 @@ def finish(params: Params, stats: Stats) -> tuple[Summary, Summary]:
 
     Raises:
         EvflowDataError: EV018 (weights of the paper's network, which has no summary, or not
-            weights), EV020 (not statistics).
+            weights), EV020 (not statistics, or a sum of none).
     """
     config, net = pooling_parts(params)
+    if isinstance(stats, int) and stats == 0:
+        raise EvflowDataError("EV020", "stats is 0, the sum of no statistics.",
+                              "Were there no windows? Pass those of one at least.")
     need(stats, Stats, "stats", "Pass the result of summarize, or a sum of results.")
     return squashed_summary(*pooled_y(net["summary"], stats, config=config))
 

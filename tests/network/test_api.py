@@ -283,6 +283,7 @@ def without_summary(params: Any) -> Any:
     ("EV018", lambda p, v, d: api.estimate({"other": {}}, v, d)),
     ("EV018", lambda p, v, d: api.estimate({"default": {}}, v, d)),
     ("EV018", lambda p, v, d: api.finish(without_summary(p), api.summarize(p, v, d))),
+    ("EV020", lambda p, v, d: api.finish(p, sum(api.summarize(p, v, d) for _ in ()))),
     ("EV002", lambda p, v, d: api.estimate(p, v, d, window_s=np.full(3, 0.05))),
     ("EV002", lambda p, v, d: api.estimate(p, v, d, intensity=d.T[:2] * 0)),
     ("EV002", lambda p, v, d: api.estimate(p, v, d, intensity=np.full(d.shape[1], 3.0))),
