@@ -26,6 +26,8 @@ LAW = "cutoff_by_light"  # 1 or 0
 MAP = "log_eps"  # 1: the sensor's log map is "log_eps", 0: "linlog"
 LOSS = "dead_contrast"  # index in LOSSES
 LOSSES: tuple[DeadContrast, ...] = ("keeps", "drops", "resets")
+LOSS_WORDS: dict[DeadContrast, str] = {
+    "keeps": "", "drops": ", events in it dropped", "resets": ", reset at its end"}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -164,7 +164,6 @@ class SensorModel(Numbers):
     cutoff_hz: float = 0.0
     cutoff_by_light: bool = True
     refractory_s: float = 0.0
-    dead_contrast: DeadContrast | Literal["auto"] = "auto"
     leak_hz: float = 0.0
     leak_jitter: float = 0.0
     leak_fpn_decades: float = 0.0
@@ -174,6 +173,7 @@ class SensorModel(Numbers):
     noise_resets_memory: bool = False
     voltmeter: Voltmeter = DVS346
     photoreceptor: SecondOrder | None = None
+    dead_contrast: DeadContrast | Literal["auto"] = "auto"
 
     def __repr__(self) -> str:
         """The fields that differ from the default."""
@@ -195,8 +195,11 @@ class SensorModel(Numbers):
             "dead_contrast": ("auto", *self._dead_contrasts())}
         for name, values in allowed.items():
             if getattr(self, name) not in values:
+                kind = f"kind={self.kind!r}, " * (name == "dead_contrast")
                 raise EvflowDataError(
-                    "EV020", f"SensorModel({name}={getattr(self, name)!r}).", f"Choose {values}.")
+                    "EV020", f"SensorModel({kind}{name}={getattr(self, name)!r}).",
+                    f"Choose {values}." + " Other kinds, v2e's time stamps and a second-order "
+                    "photoreceptor have one choice each: 'auto'." * bool(kind))
         for name in NUMBERS:
             settle(self, name, 0.0, ">= 0")
         for name in SWITCHES:

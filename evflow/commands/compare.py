@@ -65,19 +65,24 @@ class Compare(Reading):
 
     def _cameras(self, *both: tuple[Camera, Camera | None]) -> None:
         """Compare two cameras."""
-        from evflow.camera.optics import read_known, read_sensor
+        from evflow.camera.optics import LOSS_WORDS, read_known, read_sensor
         from evflow.metrics.cameras import compare_cameras, verdict
         from evflow.report.cameras import describe_cameras, write_cameras
 
         self._check_targets()
         (a, a_std), (b, b_std) = both
+        sensors = read_sensor(self.real)[0], read_sensor(self.synthetic)[0]
         numbers = compare_cameras(
             a, b, a_std, b_std, a_known=read_known(self.real), b_known=read_known(self.synthetic),
-            a_by_light=read_sensor(self.real)[0].cutoff_by_light,
-            b_by_light=read_sensor(self.synthetic)[0].cutoff_by_light)
+            a_by_light=sensors[0].cutoff_by_light, b_by_light=sensors[1].cutoff_by_light)
         if a.shape != b.shape:
             print(f"note: their maps are {a.shape} and {b.shape}: they are not compared pixel by "
                   "pixel.", file=sys.stderr)
+        laws = [sensor.in_dead_time for sensor in sensors]
+        if all(sensor.refractory_s for sensor in sensors) and laws[0] != laws[1]:
+            said = [LOSS_WORDS[law] or ", contrast kept" for law in laws]
+            print(f"note: dead times of two kinds: the first's{said[0]}; the second's{said[1]}. "
+                  "Where light changes fast, their events differ.", file=sys.stderr)
         facts = {"a": str(self.real), "b": str(self.synthetic), "verdict": verdict(numbers),
                  **numbers}
         names = _short(self.real), _short(self.synthetic)

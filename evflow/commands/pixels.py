@@ -195,11 +195,12 @@ class Pixels:
 
     def _replaced(self, path: Path) -> str:
         """What a sensor other than the measured one takes from the camera at `path`, and keeps."""
-        from evflow.camera.optics import read_sensor
+        from evflow.camera.optics import LOSS_WORDS, read_sensor
 
         (measured, optics), theirs = read_sensor(path), self.model()
         parts = [f"cutoff {measured.cutoff_hz:.0f} Hz"] * bool(measured.cutoff_hz)
-        parts += [f"dead time {1e3 * measured.refractory_s:.2f} ms"] * bool(measured.refractory_s)
+        parts += [f"dead time {1e3 * measured.refractory_s:.2f} ms"
+                  f"{LOSS_WORDS[measured.in_dead_time]}"] * bool(measured.refractory_s)
         parts += [f"{optics.offset_dn:+.1f} DN of light"] * bool(optics.offset_dn)
         lost = (f"Its measured circuit ({', '.join(parts)}) is replaced by" if parts else
                 "The circuit is")

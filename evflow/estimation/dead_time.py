@@ -22,7 +22,7 @@ STEP = 1.03  # ratio of successive candidates
 ABOVE, BELOW = (1.0, 1.1), (0.8, 0.95)  # relative ranges with many, few intervals
 ENOUGH = 200  # intervals just above
 SHARP = 8.0  # ratio of densities above and below; a slow pixel's only double over this distance
-PILED = 0.03  # relative spread at the edge of events that waited for a dead time, as v2e's do
+PILED, ROUNDED_US = 0.005, 2.0  # spread at the edge of events that waited for it, as v2e's do
 TILES, LEFT_OUT = 8, 16  # tiles a side, and those with most intervals at the edge
 PIXELS = 20  # with intervals at the edge: a hot pixel may fire as regularly as a clock
 LATTICE = 20  # distinct intervals within an octave: coarse times have an edge at each step
@@ -68,7 +68,7 @@ def dead_time(events: Events) -> DeadTime:
     if len(np.unique(octave)) < LATTICE or shorter > FEW_SHORTER or few_pixels:
         return unknown
     low, middle = np.quantile(near, [0.05, 0.5])
-    if middle - low > PILED * low:
+    if middle - low > PILED * low + ROUNDED_US:
         elsewhere = _elsewhere(pixel, at_edge, events.size)
         if _sharpness(intervals[elsewhere], edges[best:best + 1], ENOUGH // 4)[0] < SHARP:
             return unknown

@@ -11,7 +11,7 @@ from evflow.checks import need
 from evflow.errors import EvflowDataError
 from evflow.estimation.extent import Extent, covered_s
 from evflow.estimation.finish import estimate
-from evflow.estimation.front_end import FrontEnd, agree, find_front_end
+from evflow.estimation.front_end import FrontEnd, agree, find_front_end, with_dead_time
 from evflow.estimation.pipeline import check_options
 from evflow.estimation.refine import Stretch, cut
 from evflow.estimation.refine.stretches import most_simulated, spread
@@ -176,9 +176,8 @@ class CameraEstimator:
         self._measured = sum(map(_events, self._busiest))
         front_end = self._front_end(self._busiest)
         if agree(state.front_end, front_end):
-            dead = front_end.dead if front_end.dead.measured else state.front_end.dead
             return dataclasses.replace(
-                state, front_end=dataclasses.replace(state.front_end, dead=dead))
+                state, front_end=with_dead_time(state.front_end, front_end))
         kept = {id(s): s for s in (*state.read, *self._busiest)}
         stretches = tuple(sorted(kept.values(), key=lambda s: s.span_us))
         self._left = self._stretches - len(stretches)

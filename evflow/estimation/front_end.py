@@ -63,10 +63,20 @@ def agree(before: FrontEnd, now: FrontEnd) -> bool:
     same laws, and constants within two of its standard deviations."""
     if before.found is None or now.found is None:
         return now.found is None
+    if (before.lost and before.lost.law) != (now.lost and now.lost.law):
+        return False
     one, other = before.seen_by, now.seen_by
     away = [getattr(one, name) - getattr(other, name) for name in ("offset_dn", "tau_s", "delay_s")]
     return (one.log_map, one.by_light) == (other.log_map, other.by_light) and bool(
         (np.abs(away) <= 2.0 * now.found.std).all())
+
+
+def with_dead_time(before: FrontEnd, now: FrontEnd) -> FrontEnd:
+    """An earlier front end, with the dead time of a later one where that has measured it. Where
+    pixels lose contrast, it was found together with the loss, and stays."""
+    if before.lost or not now.dead.measured:
+        return before
+    return dataclasses.replace(before, dead=now.dead)
 
 
 def _faulty(stretches: Sequence[Stretch]) -> np.ndarray | None:

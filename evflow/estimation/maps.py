@@ -124,24 +124,23 @@ def with_contrast_lost(
         theta, sigma = f"theta_{name}", f"sigma_{name}"
         taken, error = (float(getattr(s, theta)) for s in (summary, summary_std))
         value, new_error = lost.corrected(p, taken, error)
-        by = np.float32(taken / value)
-        # What pixels share, relative: it is in the errors of the maps already, as it was.
-        added = np.float32(np.sqrt(np.maximum((new_error / value) ** 2 - (error / taken) ** 2, 0)))
-        camera, std = _divided(camera, std, theta, by, added)
-        summary, summary_std = _divided(summary, summary_std, sigma, by, added)
+        by, old, new = np.float32(taken / value), error / taken, new_error / value
+        camera, std = _divided(camera, std, theta, by, old, new)
+        summary, summary_std = _divided(summary, summary_std, sigma, by, 0.0, max(new - old, 0.0))
         summary = dataclasses.replace(summary, **{theta: jnp.float32(value)})
         summary_std = dataclasses.replace(summary_std, **{theta: jnp.float32(new_error)})
     return camera, std, summary, summary_std
 
 
 def _divided(
-    values: Any, errors: Any, name: str, by: np.float32, added: np.float32
+    values: Any, errors: Any, name: str, by: np.float32, old: float, new: float
 ) -> tuple[Any, Any]:
-    """A camera or a summary, and its errors, with the field `name` divided. added: relative
-    error."""
+    """A camera or a summary, and its errors, with the field `name` divided. old, new: relative
+    error that all pixels share, before and after."""
     value, error = (getattr(s, name) / by for s in (values, errors))
+    own = jnp.sqrt(jnp.maximum(error**2 - (np.float32(old) * value) ** 2, 0.0))
     return (dataclasses.replace(values, **{name: value}),
-            dataclasses.replace(errors, **{name: jnp.hypot(error, added * value)}))
+            dataclasses.replace(errors, **{name: jnp.hypot(own, np.float32(new) * value)}))
 
 
 def refined(

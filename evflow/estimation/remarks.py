@@ -105,16 +105,18 @@ def receptor_notes(
     return notes
 
 
-def lost_notes(lost: Lost | None) -> list[Note]:
+def lost_notes(lost: Lost | None, as_kept: Summary, summary: Summary) -> list[Note]:
+    """as_kept: the summary of pixels that keep the contrast."""
     if lost is None:
         return []
     how = {"drops": "events that fall into it are dropped (as by ESIM)",
            "resets": "they begin anew at its end (as an amplifier that is held in reset)"}
-    on, off = (100.0 * (x - 1.0) for x in lost.excess)
+    on, off = (100.0 * (float(getattr(as_kept, name)) / float(getattr(summary, name)) - 1.0)
+               for name in ("theta_on", "theta_off"))
     return [Note(
         "pixels.lost", f"pixels lose contrast in their dead time of {1e3 * lost.dead_s:.1f} ms: "
         f"{how[lost.law]}. Taken as kept, the thresholds would be {on:.0f} % (ON) and {off:.0f} % "
-        "(OFF) too high.")]
+        "(OFF) higher.")]
 
 
 def noise_notes(shot: Shot) -> list[Note]:

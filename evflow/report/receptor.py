@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from evflow.camera.optics import LOSS_WORDS
 from evflow.estimation.result import CameraEstimate
 from evflow.report import figures, page
 from evflow.report.page import Panel, figure, grid, number, paragraph, spread, table
@@ -27,7 +28,8 @@ def receptor_panel(found: CameraEstimate, held_out_shares: tuple[float, float] |
              if sensor.cutoff_hz else fast],
             ["light added [DN]", spread(optics.offset_dn, optics.offset_dn_std)],
             ["events after frames [ms]", spread(1e3 * optics.delay_s, 1e3 * optics.delay_s_std)],
-            ["dead time [ms]", spread(1e3 * sensor.refractory_s, 1e3 * std["refractory_s"])
+            [f"dead time [ms]{LOSS_WORDS[sensor.in_dead_time]}",
+             spread(1e3 * sensor.refractory_s, 1e3 * std["refractory_s"])
              if sensor.refractory_s else "not seen"],
             *([f"{label} [Hz per pixel]", spread(value, std[name]) if value else "not separated"]
               for label, name, value in (("leak", "leak_hz", sensor.leak_hz),

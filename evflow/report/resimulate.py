@@ -19,6 +19,7 @@ from evflow.errors import EvflowDataError
 from evflow.estimation.halves import FirstPart
 from evflow.estimation.pipeline import estimate_camera
 from evflow.estimation.refine import frame_noise, receptor_sample
+from evflow.estimation.refine.lost_contrast import without_waiting
 from evflow.estimation.refine.receptor_search import explained
 from evflow.estimation.refine.stretches import INTERVALS
 from evflow.estimation.result import CameraEstimate
@@ -231,6 +232,8 @@ def held_out_shares(
     data = receptor_sample(places, frame_noise(intervals))
     if data is None:
         return None
+    if found.sensor.in_dead_time != "resets":
+        data = without_waiting(data, found.sensor.refractory_s)
     receptor = found.receptor
     ideal = explained(data, receptor.ideal, receptor.ideal_theta)
     seen = explained(data, receptor.seen, receptor.theta) if receptor.needed else ideal

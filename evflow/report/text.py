@@ -6,6 +6,7 @@ import dataclasses
 import math
 
 from evflow.camera import Summary
+from evflow.camera.optics import LOSS_WORDS
 from evflow.estimation.bench.levels import Bench
 from evflow.estimation.result import CameraEstimate
 from evflow.report.page import number, plural, short, spread
@@ -67,7 +68,8 @@ def measured(found: CameraEstimate) -> list[str]:
     optics, sensor, std = found.optics, found.sensor, found.sensor_std
     where = "at 255 DN" if sensor.cutoff_by_light else "in any light"
     rows = [(f"cutoff (Hz {where})", sensor.cutoff_hz, std.get("cutoff_hz", math.nan)),
-            ("dead time (ms)", 1e3 * sensor.refractory_s, 1e3 * std.get("refractory_s", math.nan)),
+            (f"dead time (ms){LOSS_WORDS[sensor.in_dead_time]}", 1e3 * sensor.refractory_s,
+             1e3 * std.get("refractory_s", math.nan)),
             ("leak (Hz/pixel)", sensor.leak_hz, std.get("leak_hz", math.nan)),
             ("shot noise (Hz, dark)", sensor.shot_hz, std.get("shot_hz", math.nan)),
             ("light added (DN)", optics.offset_dn, optics.offset_dn_std),

@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -255,6 +256,19 @@ def test_two_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str], flight:
     assert same["apart"] == 0.0
     assert main(["compare", str(a), str(flight)]) == 2
     assert "is a camera" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("other", ["keeps", "resets"])
+def test_dead_times_of_two_kinds_are_not_alike(
+    other: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    paths = [tmp_path / "a.npz", tmp_path / "b.npz"]
+    for path, law in zip(paths, ("resets", other), strict=True):
+        sensor = SensorModel(refractory_s=5e-3, dead_contrast=law)
+        Camera.constant((4, 6)).save(path, **as_arrays(sensor, {"refractory_s": 1e-4}, Optics()))
+    assert main(["compare", *map(str, paths)]) == 0
+    told = "the first's, reset at its end; the second's, contrast kept" in capsys.readouterr().err
+    assert told == (other == "keeps")
 
 
 def test_two_cameras_beside_each_other_with_their_errors(

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from helpers.networks import hidden
 
-from evflow.estimation.front_end import FrontEnd, agree, find_front_end
-from evflow.estimation.refine import Stretch, cut
+from evflow.estimation.dead_time import DeadTime
+from evflow.estimation.front_end import FrontEnd, agree, find_front_end, with_dead_time
+from evflow.estimation.refine import Lost, Stretch, cut
 from evflow.recordings.windows import plan_windows
 from evflow.simulator.photoreceptor import Photoreceptor
 from evflow.types import Events, Recording
@@ -67,3 +68,21 @@ def test_what_is_measured_again_agrees_within_its_errors(
     assert agree(FrontEnd(seen, found=found), now) is same
     assert not agree(FrontEnd(seen), now)
     assert agree(FrontEnd(seen, found=found), FrontEnd())
+
+
+@pytest.mark.parametrize(("first", "second", "same"), [
+    (None, None, True), ("resets", "resets", True), (None, "resets", False),
+    ("drops", None, False), ("drops", "resets", False)])
+def test_a_dead_time_and_what_is_lost_in_it_go_together(
+    first: Any, second: Any, same: bool
+) -> None:
+    found: Any = SimpleNamespace(std=np.array([2.0, 5e-4, 1e-3]))
+
+    def front_end(law: Any, dead_s: float) -> FrontEnd:
+        lost = law and Lost(law, dead_s, 1e-4, np.array([1.2, 1.2]), np.array([0.2, 0.2]))
+        return FrontEnd(found=found, dead=DeadTime(dead_s, 1e-4), lost=lost)
+
+    before, now = front_end(first, 2e-3), front_end(second, 3e-3)
+    assert agree(before, now) is same
+    assert with_dead_time(before, now).dead.seconds == (2e-3 if first else 3e-3)
+    assert with_dead_time(before, FrontEnd(found=found)) is before

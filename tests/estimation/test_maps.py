@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 
@@ -82,9 +83,10 @@ def test_thresholds_of_pixels_that_lose_contrast_are_lowered_and_their_errors_gr
         np.testing.assert_allclose(values.theta_off, 0.25, rtol=1e-6)
         np.testing.assert_array_equal(values.eta_on, np.float32(0.1))
     assert 0.16 * 0.045 < float(summary_std.theta_on) < 0.16 * 0.06  # neither of the two alone
-    added = (float(summary_std.theta_on) / 0.16) ** 2 - (float(STD.theta_on) / 0.2) ** 2
-    np.testing.assert_allclose(std.theta_on, 0.16 * np.sqrt(0.01 + max(added, 0.0)), rtol=1e-5)
-    np.testing.assert_allclose(std.theta_off, 0.02, rtol=1e-6)
+    for got, value, error, shared in ((std.theta_on, 0.16, summary_std.theta_on, 0.01 / 0.2),
+                                      (std.theta_off, 0.25, summary_std.theta_off, 0.02 / 0.25)):
+        own = (0.1 if value == 0.16 else 0.08) ** 2 - shared**2  # relative; of all, 0 for OFF
+        np.testing.assert_allclose(got, np.hypot(value * np.sqrt(own), float(error)), rtol=1e-4)
     assert float(summary.sigma_on) == pytest.approx(0.03 / 1.25)
     assert float(summary.sigma_off) == pytest.approx(0.03)
 
@@ -103,3 +105,17 @@ def test_a_threshold_of_the_prior_is_not_corrected() -> None:
         maps, maps, SUMMARY, STD, lost_by_reset(0.1), ("on", "off"))
     assert (summary, summary_std) == (SUMMARY, STD)
     assert camera is std is maps
+
+
+def test_what_pixels_share_may_become_smaller_and_is_not_made_their_own() -> None:
+    """A camera that is drawn from the estimate is as uneven as before."""
+    shape, own, shared = (40, 50), 0.03, 0.2
+    camera = Camera(*(np.full(shape, v, np.float32) for v in (0.2, 0.25, 0.1, 0.1)))
+    errors = Camera(*(np.full(shape, 0.2 * np.hypot(own, shared), np.float32),) * 4)
+    sure = dataclasses.replace(STD, theta_on=np.float32(0.2 * shared))
+    lowered, std, summary, summary_std = with_contrast_lost(
+        camera, errors, SUMMARY, sure, lost_by_reset(0.16), ("off",))
+    assert float(summary_std.theta_on) / 0.16 < 0.07
+    known = {"theta_on": float(summary_std.theta_on) / float(summary.theta_on)}
+    drawn = lowered.drawn(jax.random.key(0), std, known)
+    assert np.std(np.asarray(drawn.theta_on)) / 0.16 == pytest.approx(own, rel=0.1)

@@ -110,6 +110,8 @@ def lost_contrast(
     if size * np.log(before / after) < CLEARLY:
         return found, None
     taken_as_kept, theta = (_solved(some, again.used)[0] for some in (data, best.data))
+    if not min(*theta, *taken_as_kept) > LEAST:
+        return found, None
     excess = taken_as_kept / theta
     if np.abs(np.log(excess)).max() < NEGLIGIBLE:
         return found, None

@@ -21,6 +21,7 @@ from helpers.films import (
     view,
 )
 
+from evflow.estimation.refine import lost_contrast as lost_module
 from evflow.estimation.refine import receptor_search
 from evflow.estimation.refine.lost_contrast import lost_contrast, without_waiting
 from evflow.estimation.refine.path import STEPS
@@ -293,3 +294,14 @@ def test_events_that_waited_for_their_dead_time_do_not_count_as_crossings() -> N
     assert abs(after.used.delay_s) < 5e-4
     assert after.explained[0] > max(before.explained) + 0.02
     np.testing.assert_allclose(after.theta, [0.25, 0.2], rtol=0.05)
+
+
+def test_thresholds_that_are_none_say_nothing_of_a_loss(monkeypatch: pytest.MonkeyPatch) -> None:
+    dn, dt_s = film(), FRAME_S / STEPS
+    data = sample_of(dn, dead_events(integrated(dn, dt_s, 0.0, 0.0, SUB), dt_s / SUB, "drops"))
+    assert lost_contrast(data, find(data), DEAD_S, sharp=True)[1] is not None
+    solved = lost_module._solved
+    monkeypatch.setattr(lost_module, "_solved", lambda *a: (
+        solved(*a)[0] * np.array([1.0, -1.0]), solved(*a)[1]))
+    kept = find(data)
+    assert lost_contrast(data, kept, DEAD_S, sharp=True) == (kept, None)
