@@ -137,7 +137,9 @@ def estimate(
         camera, error, summary, std = maps.with_contrast_lost(
             camera, error, summary, std, lost, lacking)
     extent = extent or EVERYTHING
-    thirds = drift.thirds(state.parts, lost.excess if lost else 1.0)
+    # Each third's thresholds are a regression's, which what is kept does not move.
+    thirds = drift.thirds(
+        state.parts, lost.excess if lost and lost.law != "keeps" else 1.0)
     return CameraEstimate(
         camera, error, summary, std, (state.n_shown >= VALID_EVENTS) & ~hot, n_events, hot, dead,
         state.windows,
@@ -193,9 +195,10 @@ def _measured(
     found, dead = front_end.found, front_end.dead
     sensor, std = found.sensor if found else (SensorModel(noise_resets_memory=True), {})
     sensor, std = measured_noise(sensor, std, leak, shot)
-    law = front_end.lost.law if front_end.lost else "auto"
+    law = front_end.law
     fields = {"sensor": dataclasses.replace(
-                  sensor, refractory_s=dead.seconds, dead_contrast=law),
+                  sensor, refractory_s=dead.seconds,
+                  dead_contrast="auto" if law == "keeps" else law),
               "sensor_std": {**std, "refractory_s": dead.std_s}}
     return {**fields, "optics": optics, "receptor": found} if found else fields
 

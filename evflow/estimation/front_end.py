@@ -12,6 +12,7 @@ import numpy as np
 
 from evflow.estimation.dead_time import DeadTime, dead_time, first_events
 from evflow.estimation.refine import Found, Lost, Stretch, find_photoreceptor, frame_noise
+from evflow.estimation.refine.lost_contrast import Law
 from evflow.estimation.refine.path import Films
 from evflow.estimation.refine.photoreceptor import STRETCHES
 from evflow.recordings.faulty_pixels import dead_pixels, hot_among_neighbours
@@ -35,6 +36,11 @@ class FrontEnd:
     faulty: np.ndarray | None = None
     films: Films = dataclasses.field(default_factory=dict)
 
+    @property
+    def law(self) -> Law:
+        """What becomes of contrast in the dead time."""
+        return self.lost.law if self.lost else "keeps"
+
 
 def find_front_end(stretches: Sequence[Stretch], *, measured: bool) -> FrontEnd:
     """Measure the front end on some stretches of a recording. measured: False assumes ideal
@@ -55,7 +61,9 @@ def find_front_end(stretches: Sequence[Stretch], *, measured: bool) -> FrontEnd:
 
 def begun_anew(dead: DeadTime, lost: Lost | None) -> DeadTime:
     """The dead time of pixels that lose contrast in it: it is shorter than their intervals."""
-    return dead if lost is None else DeadTime(lost.dead_s, lost.std_s)
+    if lost is None or lost.law == "keeps":
+        return dead
+    return DeadTime(lost.dead_s, lost.std_s)
 
 
 def agree(before: FrontEnd, now: FrontEnd) -> bool:
@@ -63,7 +71,7 @@ def agree(before: FrontEnd, now: FrontEnd) -> bool:
     same laws, and constants within two of its standard deviations."""
     if before.found is None or now.found is None:
         return now.found is None
-    if (before.lost and before.lost.law) != (now.lost and now.lost.law):
+    if before.law != now.law:
         return False
     one, other = before.seen_by, now.seen_by
     away = [getattr(one, name) - getattr(other, name) for name in ("offset_dn", "tau_s", "delay_s")]
@@ -74,7 +82,7 @@ def agree(before: FrontEnd, now: FrontEnd) -> bool:
 def with_dead_time(before: FrontEnd, now: FrontEnd) -> FrontEnd:
     """An earlier front end, with the dead time of a later one where that has measured it. Where
     pixels lose contrast, it was found together with the loss, and stays."""
-    if before.lost or not now.dead.measured:
+    if before.law != "keeps" or not now.dead.measured:
         return before
     return dataclasses.replace(before, dead=now.dead)
 

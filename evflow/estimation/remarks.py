@@ -107,7 +107,7 @@ def receptor_notes(
 
 def lost_notes(lost: Lost | None, as_kept: Summary, summary: Summary) -> list[Note]:
     """as_kept: the summary of pixels that keep the contrast."""
-    if lost is None:
+    if lost is None or lost.law == "keeps":
         return []
     how = {"drops": "events that fall into it are dropped (as by ESIM)",
            "resets": "they begin anew at its end (as an amplifier that is held in reset)"}

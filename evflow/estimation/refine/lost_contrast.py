@@ -13,18 +13,22 @@ import dataclasses
 from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
+from evflow.camera import Camera
+from evflow.camera.sensors import SensorModel
 from evflow.estimation.refine.receptor_data import Sample, one_stretch
 from evflow.estimation.refine.receptor_noise import path_of
 from evflow.estimation.refine.receptor_regression import Regression
 from evflow.estimation.refine.receptor_result import Found
 from evflow.estimation.refine.receptor_search import BELIEVED, find
+from evflow.simulator.counts import simulate_counts
 from evflow.simulator.photoreceptor import FAST, Photoreceptor
 
 Array = np.ndarray
-Law = Literal["drops", "resets"]
+Law = Literal["keeps", "drops", "resets"]
 
 CLEARLY = 6.0  # log odds required against a pixel that keeps its contrast
 # A pixel that begins anew needs a threshold's worth of change after its dead time, which is
@@ -33,6 +37,8 @@ COARSE, FINE = (0.25, 0.5, 0.75, 1.0), np.arange(-0.2, 0.21, 0.05)
 NEGLIGIBLE = 0.02  # log units of a threshold, less than what is known of it
 LEAST = 1e-3  # log units, of a threshold
 WAITED, HARDLY = 1.05, 1e-4  # of the dead time; of a weight
+SOLVED = 6  # steps towards the thresholds of as many events
+NO_NOISE = jax.random.key(0)  # not used
 ROUNDS = 3  # of thresholds and whole events lost, each from the other
 # Of 25 cameras, in logarithms: error of the correction by its size, and of the regression itself,
 # whose path is smoother than the light. Each is far off in other scenes than the other.
@@ -41,9 +47,10 @@ SHARE_ERROR, OWN_ERROR = 0.4, 0.06
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Lost:
-    """law: how the contrast is lost; dead_s: the dead time in seconds, and std_s its error; excess:
-    (2,) factors by which theta_on and theta_off come out too high if it is taken as kept; theta:
-    (2,) of the regression without that contrast."""
+    """law: how the contrast is lost, "keeps" if it is sent later, some of it never; dead_s: the
+    dead time in seconds, and std_s its error; excess: (2,) factors by which theta_on and theta_off
+    come out too high if it is taken as sent; theta: (2,) of the regression without that
+    contrast."""
 
     law: Law
     dead_s: float
@@ -56,6 +63,9 @@ class Lost:
         precision, of that divided by its excess, and of the regression's own. Where both disagree
         by more than their errors, these are taken as too small."""
         excess = float(self.excess[polarity])
+        if self.law == "keeps":
+            error = np.hypot(std, SHARE_ERROR * np.log(excess) * theta)
+            return theta / excess, float(error) / excess
         divided, own = np.log(theta / excess), np.log(float(self.theta[polarity]))
         stated = std / theta if np.isfinite(std) else OWN_ERROR  # not all weights state one
         variance, own_variance = stated**2 + (SHARE_ERROR * np.log(excess)) ** 2, OWN_ERROR**2
@@ -64,6 +74,36 @@ class Lost:
         apart = max(1.0, float(divided - own) ** 2 / both)
         error = value * float(np.sqrt(apart * variance * own_variance / both))
         return value, error if np.isfinite(std) else std
+
+
+def kept_contrast(data: Sample, found: Found, dead_s: float) -> Lost | None:
+    """How many events fewer pixels send that keep the contrast of their dead time: ON and OFF of it
+    may cancel, and what is owed at last is never sent. None if that is negligible."""
+    excess = np.ones(2)
+    dead, free = SensorModel(refractory_s=dead_s), SensorModel()
+    paths = []
+    for c in range(len(data.dn)):
+        d = one_stretch(data, c)
+        path = path_of(d, found.used)
+        paths.append((np.clip(path - path.min(), 0.0, 5.5), float(np.mean(d.dt_s))))
+    sent = _counted(paths, found.theta, dead)
+    for _ in range(SOLVED):
+        excess = excess * (_counted(paths, found.theta * excess, free) / np.maximum(sent, 1)) ** 0.7
+    if np.abs(np.log(excess)).max() < NEGLIGIBLE:
+        return None
+    return Lost("keeps", dead_s, 0.02 * dead_s, excess, found.theta)
+
+
+def _counted(paths: list[tuple[Array, float]], theta: Array, model: SensorModel) -> Array:
+    """(2,) ON and OFF events of pixels with these thresholds, along paths (T, N), and their
+    steps in seconds."""
+    total = np.zeros(2)
+    for path, dt_s in paths:
+        camera = Camera.constant((path.shape[1], 1), *map(float, theta))
+        counts = simulate_counts(NO_NOISE, path[:, :, None].astype(np.float32), camera,
+                                 frame_dt_s=dt_s, model=model)
+        total += np.asarray(counts).sum((0, 1))
+    return total
 
 
 def without_waiting(data: Sample, dead_s: float) -> Sample:

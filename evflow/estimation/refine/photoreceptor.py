@@ -8,7 +8,12 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from evflow.estimation.refine.lost_contrast import Lost, lost_contrast, without_waiting
+from evflow.estimation.refine.lost_contrast import (
+    Lost,
+    kept_contrast,
+    lost_contrast,
+    without_waiting,
+)
 from evflow.estimation.refine.path import STEPS, Films, Place, as_seen, interpolated, of_place
 from evflow.estimation.refine.readouts import without_readouts
 from evflow.estimation.refine.receptor_data import Part, Sample, sample
@@ -73,7 +78,8 @@ def find_photoreceptor(
         shortest_s, sharp: as of `lost_contrast`; 0 where no shortest intervals are known.
 
     Returns:
-        The photoreceptor, None with too few events; and what is lost, None if it is kept.
+        The photoreceptor, None with too few events; and what is lost, None if it is kept and is
+        sent almost completely.
     """
     data = receptor_sample(places, noise_dn, films)
     if data is not None and sharp:
@@ -81,4 +87,7 @@ def find_photoreceptor(
     found = find(data) if data is not None else None
     if data is None or found is None or not shortest_s:
         return found, None
-    return lost_contrast(data, found, shortest_s, sharp=sharp)
+    found, lost = lost_contrast(data, found, shortest_s, sharp=sharp)
+    if lost is None and sharp:
+        lost = kept_contrast(data, found, shortest_s)
+    return found, lost

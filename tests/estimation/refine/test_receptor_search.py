@@ -23,7 +23,7 @@ from helpers.films import (
 
 from evflow.estimation.refine import lost_contrast as lost_module
 from evflow.estimation.refine import receptor_search
-from evflow.estimation.refine.lost_contrast import lost_contrast, without_waiting
+from evflow.estimation.refine.lost_contrast import kept_contrast, lost_contrast, without_waiting
 from evflow.estimation.refine.path import STEPS
 from evflow.estimation.refine.receptor_data import Sample, sample
 from evflow.estimation.refine.receptor_prior import FEW, FEWER, small_sample_odds
@@ -305,3 +305,20 @@ def test_thresholds_that_are_none_say_nothing_of_a_loss(monkeypatch: pytest.Monk
         solved(*a)[0] * np.array([1.0, -1.0]), solved(*a)[1]))
     kept = find(data)
     assert lost_contrast(data, kept, DEAD_S, sharp=True) == (kept, None)
+
+
+@pytest.mark.parametrize(("dead_s", "some"), [(DEAD_S, True), (1e-4, False)])
+def test_contrast_that_is_kept_and_never_sent_is_known_from_the_path(
+    dead_s: float, some: bool
+) -> None:
+    dn, dt_s = view(), FRAME_S / STEPS
+    data = sample_of(dn, dead_events(integrated(dn, dt_s, 0.0, 0.0, SUB), dt_s / SUB, "keeps"))
+    found = find(without_waiting(data, DEAD_S))
+    lost = kept_contrast(data, found, dead_s)
+    assert (lost is not None) == some
+    if lost:
+        assert lost.law == "keeps"
+        assert ((lost.excess > 1.05) & (lost.excess < 1.5)).all()
+        value, error = lost.corrected(0, 0.3, 0.01)
+        assert value == pytest.approx(0.3 / lost.excess[0])
+        assert error > 0.01 / lost.excess[0]
