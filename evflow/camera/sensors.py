@@ -130,11 +130,6 @@ class SensorModel(Numbers):
             any light, as when a later stage, not the photoreceptor, limits the bandwidth.
         refractory_s: dead time after an event of light or leak in seconds. Noise events (eta,
             shot_hz) neither wait for it nor begin it.
-        dead_contrast: what becomes of contrast that changes in the dead time: "keeps" = it fires
-            later (v2e); "drops" = events that fall into it are lost (ESIM); "resets" = the pixel
-            begins anew at its end, as an amplifier held in reset (Lichtsteiner et al. 2008).
-            "auto" is the kind's own, and "resets" with a second-order photoreceptor. Kind "v2e"
-            with crossing times has the choice.
         leak_hz: ON leak events per second.
         leak_jitter: relative jitter of each leak step.
         leak_fpn_decades: spread of the leak's fixed pattern over pixels, in decades.
@@ -149,6 +144,11 @@ class SensorModel(Numbers):
         voltmeter: constants of kind "voltmeter".
         photoreceptor: a `SecondOrder` in place of the first-order low-pass, for kind "v2e" with
             crossing times.
+        dead_contrast: what becomes of contrast that changes in the dead time: "keeps" = it fires
+            later (v2e); "drops" = events that fall into it are lost (ESIM); "resets" = the pixel
+            begins anew at its end, as an amplifier held in reset (Lichtsteiner et al. 2008).
+            "auto" is the kind's own, and "resets" with a second-order photoreceptor. Kind "v2e"
+            with crossing times has the choice.
 
     Raises:
         EvflowDataError: EV020 (an unknown choice, a negative value, a field of another type, or an

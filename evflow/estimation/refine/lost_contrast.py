@@ -38,7 +38,6 @@ NEGLIGIBLE = 0.02  # log units of a threshold, less than what is known of it
 LEAST = 1e-3  # log units, of a threshold
 WAITED, HARDLY = 1.05, 1e-4  # of the dead time; of a weight
 SOLVED = 6  # steps towards the thresholds of as many events
-NO_NOISE = jax.random.key(0)  # not used
 ROUNDS = 3  # of thresholds and whole events lost, each from the other
 # Of 25 cameras, in logarithms: error of the correction by its size, and of the regression itself,
 # whose path is smoother than the light. Each is far off in other scenes than the other.
@@ -97,10 +96,10 @@ def kept_contrast(data: Sample, found: Found, dead_s: float) -> Lost | None:
 def _counted(paths: list[tuple[Array, float]], theta: Array, model: SensorModel) -> Array:
     """(2,) ON and OFF events of pixels with these thresholds, along paths (T, N), and their
     steps in seconds."""
-    total = np.zeros(2)
+    total, unused = np.zeros(2), jax.random.key(0)  # there is no noise
     for path, dt_s in paths:
         camera = Camera.constant((path.shape[1], 1), *map(float, theta))
-        counts = simulate_counts(NO_NOISE, path[:, :, None].astype(np.float32), camera,
+        counts = simulate_counts(unused, path[:, :, None].astype(np.float32), camera,
                                  frame_dt_s=dt_s, model=model)
         total += np.asarray(counts).sum((0, 1))
     return total
