@@ -132,7 +132,7 @@ def estimate(
         again = _counted(windows_of(state.read), advance)
         camera, error = maps.by_flow(state.params, again, summary, std)
     camera, error, summary, std = maps.with_rates(camera, error, sent, hot, summary, std)
-    as_kept = summary
+    as_sent = summary
     if lost := front_end.lost:
         camera, error, summary, std = maps.with_contrast_lost(
             camera, error, summary, std, lost, lacking)
@@ -145,7 +145,7 @@ def estimate(
         state.windows,
         (*before, *camera_notes(stats, lacking, alone, n_events, summary, hot, dead, by_drift),
          *receptor_notes(front_end.found, refined.optics, summary, std),
-         *lost_notes(lost, as_kept, summary), *noise_notes(shot),
+         *lost_notes(lost, as_sent, summary), *noise_notes(shot),
          *drift_notes(quiet.drift, by_drift), *after, *extent.notes(), *drift.notes(thirds)),
         tuple(f"theta_{name}" for name in lacking),
         **_measured(front_end, refined.optics, leak, shot), extent=extent, thirds=thirds)

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from evflow.camera.sensors import DeadContrast
 from evflow.estimation.dead_time import DeadTime, dead_time, first_events
 from evflow.estimation.refine import Found, Lost, Stretch, find_photoreceptor, frame_noise
-from evflow.estimation.refine.lost_contrast import Law
 from evflow.estimation.refine.path import Films
 from evflow.estimation.refine.photoreceptor import STRETCHES
 from evflow.recordings.faulty_pixels import dead_pixels, hot_among_neighbours
@@ -37,7 +37,7 @@ class FrontEnd:
     films: Films = dataclasses.field(default_factory=dict)
 
     @property
-    def law(self) -> Law:
+    def law(self) -> DeadContrast:
         """What becomes of contrast in the dead time."""
         return self.lost.law if self.lost else "keeps"
 

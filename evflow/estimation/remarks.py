@@ -105,17 +105,18 @@ def receptor_notes(
     return notes
 
 
-def lost_notes(lost: Lost | None, as_kept: Summary, summary: Summary) -> list[Note]:
-    """as_kept: the summary of pixels that keep the contrast."""
-    if lost is None or lost.law == "keeps":
+def lost_notes(lost: Lost | None, as_sent: Summary, summary: Summary) -> list[Note]:
+    """as_sent: the summary of pixels that send all contrast."""
+    if lost is None:
         return []
-    how = {"drops": "events that fall into it are dropped (as by ESIM)",
+    how = {"keeps": "it fires later (as in v2e), but ON and OFF of one dead time cancel",
+           "drops": "events that fall into it are dropped (as by ESIM)",
            "resets": "they begin anew at its end (as an amplifier that is held in reset)"}
-    on, off = (100.0 * (float(getattr(as_kept, name)) / float(getattr(summary, name)) - 1.0)
+    on, off = (100.0 * (float(getattr(as_sent, name)) / float(getattr(summary, name)) - 1.0)
                for name in ("theta_on", "theta_off"))
     return [Note(
         "pixels.lost", f"pixels lose contrast in their dead time of {1e3 * lost.dead_s:.1f} ms: "
-        f"{how[lost.law]}. Taken as kept, the thresholds would be {on:.0f} % (ON) and {off:.0f} % "
+        f"{how[lost.law]}. Taken as sent, the thresholds would be {on:.0f} % (ON) and {off:.0f} % "
         "(OFF) higher.")]
 
 

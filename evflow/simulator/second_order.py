@@ -20,10 +20,10 @@ import jax.numpy as jnp
 
 from evflow.camera.sensors import SecondOrder
 from evflow.simulator.constants import Constants
+from evflow.simulator.spikes import NEVER
 
 Array = jax.Array
 
-NEVER = 1e9  # intervals
 NO_TIME = 1e-9  # seconds
 TINY = 1e-9  # a rise that reaches no threshold, with a nonzero square for gradients
 APART = 1e-3  # least |(1 - tau_f p1)(1 - tau_f p2)| of the poles p; closer ones are moved apart

@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import Camera
-from evflow.camera.sensors import SensorModel
+from evflow.camera.sensors import DeadContrast, SensorModel
 from evflow.estimation.refine.receptor_data import Sample, one_stretch
 from evflow.estimation.refine.receptor_noise import path_of
 from evflow.estimation.refine.receptor_regression import Regression
@@ -28,7 +28,6 @@ from evflow.simulator.counts import simulate_counts
 from evflow.simulator.photoreceptor import FAST, Photoreceptor
 
 Array = np.ndarray
-Law = Literal["keeps", "drops", "resets"]
 
 CLEARLY = 6.0  # log odds required against a pixel that keeps its contrast
 # A pixel that begins anew needs a threshold's worth of change after its dead time, which is
@@ -37,6 +36,8 @@ COARSE, FINE = (0.25, 0.5, 0.75, 1.0), np.arange(-0.2, 0.21, 0.05)
 NEGLIGIBLE = 0.02  # log units of a threshold, less than what is known of it
 LEAST = 1e-3  # log units, of a threshold
 WAITED, HARDLY = 1.05, 1e-4  # of the dead time; of a weight
+DARKEST = -6.9  # log units below the brightest, that a simulation of the log map log_eps takes
+ENOUGH = 100  # events of a polarity, that such a simulation must send
 SOLVED = 6  # steps towards the thresholds of as many events
 ROUNDS = 3  # of thresholds and whole events lost, each from the other
 # Of 25 cameras, in logarithms: error of the correction by its size, and of the regression itself,
@@ -51,7 +52,7 @@ class Lost:
     come out too high if it is taken as sent; theta: (2,) of the regression without that
     contrast."""
 
-    law: Law
+    law: DeadContrast
     dead_s: float
     std_s: float
     excess: Array
@@ -77,17 +78,23 @@ class Lost:
 
 def kept_contrast(data: Sample, found: Found, dead_s: float) -> Lost | None:
     """How many events fewer pixels send that keep the contrast of their dead time: ON and OFF of it
-    may cancel, and what is owed at last is never sent. None if that is negligible."""
+    may cancel, and what is owed at last is never sent. None if that is negligible, or unknown: too
+    few events, or thresholds that are none."""
+    if not min(found.theta) > LEAST:
+        return None
     excess = np.ones(2)
-    dead, free = SensorModel(refractory_s=dead_s), SensorModel()
+    dead, free = (SensorModel(log_map="log_eps", refractory_s=s) for s in (dead_s, 0.0))
     paths = []
     for c in range(len(data.dn)):
         d = one_stretch(data, c)
         path = path_of(d, found.used)
-        paths.append((np.clip(path - path.min(), 0.0, 5.5), float(np.mean(d.dt_s))))
+        paths.append((np.maximum(path - path.max(), DARKEST), float(np.mean(d.dt_s))))
     sent = _counted(paths, found.theta, dead)
+    if sent.min() < ENOUGH:
+        return None
     for _ in range(SOLVED):
-        excess = excess * (_counted(paths, found.theta * excess, free) / np.maximum(sent, 1)) ** 0.7
+        more = _counted(paths, found.theta * excess, free) / sent
+        excess = np.maximum(excess * more**0.7, 1.0)
     if np.abs(np.log(excess)).max() < NEGLIGIBLE:
         return None
     return Lost("keeps", dead_s, 0.02 * dead_s, excess, found.theta)
@@ -165,7 +172,7 @@ class Way(NamedTuple):
     photoreceptor; data: the sample with that contrast taken out."""
 
     gain: float
-    law: Law
+    law: DeadContrast
     dead_s: float
     seen_by: Photoreceptor
     data: Sample

@@ -3,6 +3,7 @@ found again in events that an independent pixel makes of a known film."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -305,6 +306,15 @@ def test_thresholds_that_are_none_say_nothing_of_a_loss(monkeypatch: pytest.Monk
         solved(*a)[0] * np.array([1.0, -1.0]), solved(*a)[1]))
     kept = find(data)
     assert lost_contrast(data, kept, DEAD_S, sharp=True) == (kept, None)
+
+
+def test_too_few_events_and_no_thresholds_say_nothing_of_what_is_never_sent() -> None:
+    dn, dt_s = view(), FRAME_S / STEPS
+    data = sample_of(dn, dead_events(integrated(dn, dt_s, 0.0, 0.0, SUB), dt_s / SUB, "keeps"))
+    found = find(without_waiting(data, DEAD_S))
+    for theta in ([np.nan, 0.2], [-0.1, 0.2], [0.25, 50.0]):
+        other = dataclasses.replace(found, theta=np.array(theta))
+        assert kept_contrast(data, other, DEAD_S) is None
 
 
 @pytest.mark.parametrize(("dead_s", "some"), [(DEAD_S, True), (1e-4, False)])
