@@ -30,6 +30,7 @@ NOTES: dict[str, str] = {
     "sensor.size": "the size of the sensor was inferred",
     "sensor.unrectified": "events keep the sensor's raw pixel coordinates",
     "frames.alpha": "transparent images were composited onto a background",
+    "frames.blur": "the blur of the frames' exposure is left in them",
     "frames.clock": "where the times of the frames come from",
     "frames.coarse": "the frame rate is too low for the low-pass",
     "frames.cut": "the scene is cut between two frames",

@@ -35,14 +35,17 @@ class Optics:
     """How the frames of a recording relate to the light on its pixels.
 
     offset_dn: light in DN that the pixels see and the frames do not show (dark light minus the
-    frames' black level); delay_s: delay in seconds of events after the frame times; and the
-    standard deviations of both, NaN where not measured.
+    frames' black level); delay_s: delay in seconds of events after the frame times; exposure_s: of
+    the frames in seconds, as their blur shows, 0 where a file told it or nothing shows it; and the
+    standard deviations of these, NaN where not measured.
     """
 
     offset_dn: float = 0.0
     delay_s: float = 0.0
     offset_dn_std: float = float("nan")
     delay_s_std: float = float("nan")
+    exposure_s: float = 0.0
+    exposure_s_std: float = float("nan")
 
 
 def as_arrays(

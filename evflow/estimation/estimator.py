@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -11,9 +12,16 @@ from evflow.checks import need
 from evflow.errors import EvflowDataError
 from evflow.estimation.extent import Extent, covered_s
 from evflow.estimation.finish import estimate
-from evflow.estimation.front_end import FrontEnd, agree, find_front_end, with_dead_time
+from evflow.estimation.front_end import (
+    FrontEnd,
+    agree,
+    find_exposure,
+    find_front_end,
+    with_dead_time,
+)
 from evflow.estimation.pipeline import check_options
 from evflow.estimation.refine import Stretch, cut
+from evflow.estimation.refine.frame_exposure import UNSEEN, Exposure, exposed
 from evflow.estimation.refine.stretches import most_simulated, spread
 from evflow.estimation.result import CameraEstimate
 from evflow.estimation.state import State, add, thinned
@@ -126,10 +134,10 @@ class CameraEstimator:
             self._waiting += stretches
             if len(self._waiting) >= self.FIRST:
                 self._measured = sum(map(_events, self._busiest))
-                self._state = self._read(self._waiting, self._front_end(self._waiting))
+                self._state = self._begun()
                 self._waiting = ()
         else:
-            for stretch in stretches:
+            for stretch in exposed(stretches, self._state.front_end.exposure):
                 self._state = self._next(self._state, stretch)
             if sum(map(_events, self._busiest)) > self.AGAIN * self._measured:
                 self._state = self._again(self._state)
@@ -147,7 +155,7 @@ class CameraEstimator:
         """
         state = self._state
         if state is None and self._waiting:
-            state = self._read(self._waiting, self._front_end(self._waiting))
+            state = self._begun()
         if state is None:
             raise EvflowDataError(
                 "EV017", "no usable window was added"
@@ -174,18 +182,30 @@ class CameraEstimator:
         """The state, or where its front end is not that of the busiest stretches, a new one of the
         stretches that are kept."""
         self._measured = sum(map(_events, self._busiest))
-        front_end = self._front_end(self._busiest)
+        exposure = self._exposure(self._busiest)
+        exposure = exposure if exposure.seconds else state.front_end.exposure
+        of_span = {s.span_us: s for s in (*state.read, *self._busiest)}
+        stretches = exposed([of_span[span] for span in sorted(of_span)], exposure)
+        busiest = {s.span_us for s in self._busiest}
+        front_end = self._front_end([s for s in stretches if s.span_us in busiest], exposure)
         if agree(state.front_end, front_end):
             return dataclasses.replace(
                 state, front_end=with_dead_time(state.front_end, front_end))
-        kept = {id(s): s for s in (*state.read, *self._busiest)}
-        stretches = tuple(sorted(kept.values(), key=lambda s: s.span_us))
         self._left = self._stretches - len(stretches)
         self._left_s = self._seconds - covered_s(s.span_us for s in stretches)
         return self._read(stretches, front_end)
 
-    def _front_end(self, stretches: tuple[Stretch, ...]) -> FrontEnd:
-        return find_front_end(stretches, measured=self._pixel == "measured")
+    def _begun(self) -> State:
+        """The state of the stretches that wait."""
+        exposure = self._exposure(self._waiting)
+        stretches = exposed(self._waiting, exposure)
+        return self._read(stretches, self._front_end(stretches, exposure))
+
+    def _exposure(self, stretches: Sequence[Stretch]) -> Exposure:
+        return find_exposure(stretches) if self._pixel == "measured" else UNSEEN
+
+    def _front_end(self, stretches: Sequence[Stretch], exposure: Exposure) -> FrontEnd:
+        return find_front_end(stretches, exposure, measured=self._pixel == "measured")
 
     def _read(self, stretches: tuple[Stretch, ...], front_end: FrontEnd) -> State:
         """The state of some stretches."""

@@ -28,6 +28,7 @@ from evflow.estimation.refine import Chunk
 from evflow.estimation.remarks import (
     camera_notes,
     drift_notes,
+    exposure_notes,
     lost_notes,
     noise_notes,
     receptor_notes,
@@ -145,7 +146,8 @@ def estimate(
         state.windows,
         (*before, *camera_notes(stats, lacking, alone, n_events, summary, hot, dead, by_drift),
          *receptor_notes(front_end.found, refined.optics, summary, std),
-         *lost_notes(lost, as_sent, summary), *noise_notes(shot),
+         *exposure_notes(front_end.exposure), *lost_notes(lost, as_sent, summary),
+         *noise_notes(shot),
          *drift_notes(quiet.drift, by_drift), *after, *extent.notes(), *drift.notes(thirds)),
         tuple(f"theta_{name}" for name in lacking),
         **_measured(front_end, refined.optics, leak, shot), extent=extent, thirds=thirds)
@@ -200,7 +202,10 @@ def _measured(
                   sensor, refractory_s=dead.seconds,
                   dead_contrast="auto" if law == "keeps" else law),
               "sensor_std": {**std, "refractory_s": dead.std_s}}
-    return {**fields, "optics": optics, "receptor": found} if found else fields
+    exposure = front_end.exposure
+    fields["optics"] = dataclasses.replace(
+        optics or Optics(), exposure_s=exposure.seconds, exposure_s_std=exposure.std_s)
+    return {**fields, "receptor": found} if found else fields
 
 
 def _without(chunk: Chunk, faulty: Array) -> Chunk:

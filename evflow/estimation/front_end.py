@@ -13,8 +13,9 @@ import numpy as np
 from evflow.camera.sensors import DeadContrast
 from evflow.estimation.dead_time import DeadTime, dead_time, first_events
 from evflow.estimation.refine import Found, Lost, Stretch, find_photoreceptor, frame_noise
+from evflow.estimation.refine.frame_exposure import UNSEEN, Exposure, frame_exposure
 from evflow.estimation.refine.path import Films
-from evflow.estimation.refine.photoreceptor import STRETCHES
+from evflow.estimation.refine.photoreceptor import STRETCHES, receptor_places
 from evflow.recordings.faulty_pixels import dead_pixels, hot_among_neighbours
 from evflow.simulator.photoreceptor import IDEAL, Photoreceptor
 
@@ -25,7 +26,8 @@ class FrontEnd:
     and their exposure, 0 if it is unknown; found: the search for the photoreceptor, None if there
     was none; dead: the dead time; lost: the contrast that pixels lose in it, None if they keep it;
     faulty: (H, W) bool, pixels that fire alone or never, None if
-    there are none; films: of stretches that are still to be read."""
+    there are none; films: of stretches that are still to be read; exposure: of the frames, as their
+    blur shows."""
 
     seen_by: Photoreceptor = IDEAL
     noise_dn: float = 0.0
@@ -35,6 +37,7 @@ class FrontEnd:
     lost: Lost | None = None
     faulty: np.ndarray | None = None
     films: Films = dataclasses.field(default_factory=dict)
+    exposure: Exposure = UNSEEN
 
     @property
     def law(self) -> DeadContrast:
@@ -42,9 +45,16 @@ class FrontEnd:
         return self.lost.law if self.lost else "keeps"
 
 
-def find_front_end(stretches: Sequence[Stretch], *, measured: bool) -> FrontEnd:
-    """Measure the front end on some stretches of a recording. measured: False assumes ideal
-    pixels."""
+def find_exposure(stretches: Sequence[Stretch]) -> Exposure:
+    """The exposure of the frames, where nobody says it and their blur shows it."""
+    return frame_exposure(receptor_places([(s.recording, s.run) for s in stretches if s.run]))
+
+
+def find_front_end(
+    stretches: Sequence[Stretch], exposure: Exposure = UNSEEN, *, measured: bool
+) -> FrontEnd:
+    """Measure the front end on some stretches of a recording. exposure: as measured, if the
+    recordings have it. measured: False assumes ideal pixels."""
     dead = dead_time(first_events(max((s.recording.events for s in stretches), key=len)))
     faulty = _faulty(stretches)
     runs = [(s.recording, s.run) for s in stretches if s.run]
@@ -56,7 +66,8 @@ def find_front_end(stretches: Sequence[Stretch], *, measured: bool) -> FrontEnd:
                                       sharp=dead.measured) if measured else (None, None))
     blur_s = 1e-6 * float(np.mean([recording.exposure_us for recording, _ in runs]))
     seen_by = found.used if found else IDEAL
-    return FrontEnd(seen_by, noise_dn, blur_s, found, begun_anew(dead, lost), lost, faulty, films)
+    return FrontEnd(seen_by, noise_dn, blur_s, found, begun_anew(dead, lost), lost, faulty, films,
+                    exposure)
 
 
 def begun_anew(dead: DeadTime, lost: Lost | None) -> DeadTime:
@@ -71,7 +82,7 @@ def agree(before: FrontEnd, now: FrontEnd) -> bool:
     same laws, and constants within two of its standard deviations."""
     if before.found is None or now.found is None:
         return now.found is None
-    if before.law != now.law:
+    if before.law != now.law or not _same(before.exposure, now.exposure):
         return False
     one, other = before.seen_by, now.seen_by
     away = [getattr(one, name) - getattr(other, name) for name in ("offset_dn", "tau_s", "delay_s")]
@@ -85,6 +96,11 @@ def with_dead_time(before: FrontEnd, now: FrontEnd) -> FrontEnd:
     if before.law != "keeps" or not now.dead.measured:
         return before
     return dataclasses.replace(before, dead=now.dead)
+
+
+def _same(before: Exposure, now: Exposure) -> bool:
+    """As `agree`, of the exposure."""
+    return not now.seconds or abs(before.seconds - now.seconds) <= 2.0 * now.std_s
 
 
 def _faulty(stretches: Sequence[Stretch]) -> np.ndarray | None:

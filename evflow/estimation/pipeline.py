@@ -24,10 +24,11 @@ from evflow.camera import Summary
 from evflow.errors import EvflowDataError
 from evflow.estimation.extent import Extent, covered_s
 from evflow.estimation.finish import Stage, estimate
-from evflow.estimation.front_end import find_front_end
+from evflow.estimation.front_end import find_exposure, find_front_end
 from evflow.estimation.halves import FirstPart, divided
 from evflow.estimation.reading import BATCH, BUDGETS, EFFORTS, Effort, Order, gain, ordered
 from evflow.estimation.refine import Stretch, cut, pixel_posterior
+from evflow.estimation.refine.frame_exposure import UNSEEN, exposed
 from evflow.estimation.result import CameraEstimate
 from evflow.estimation.state import State, add, read_stretch, summary_so_far
 from evflow.estimation.static import estimate_noise
@@ -127,10 +128,13 @@ def measure(
         return Measured(_unpooled(recording, plan, params, progress, stage))
     stretches = cut(recording, plan, path=refine == "auto")
     order = ordered(stretches, effort)
-    used = [stretches[i] for i in sorted(order.numbers)]
     release(recording)
     stage("looking for the photoreceptor")
-    state = State(params, find_front_end(used, measured=pixel == "measured"))
+    measured = pixel == "measured"
+    exposure = find_exposure(_used(stretches, order)) if measured else UNSEEN
+    stretches = exposed(stretches, exposure)
+    used = _used(stretches, order)
+    state = State(params, find_front_end(used, exposure, measured=measured))
     counter = ProgressCounter(used, progress)
     stage("reading stretches")
     division = divided(stretches)
@@ -142,6 +146,11 @@ def measure(
     counter.finish()
     first = FirstPart(early, tuple(used), division.rest) if division and early.read else None
     return Measured(found, first)
+
+
+def _used(stretches: Sequence[Stretch], order: Order) -> list[Stretch]:
+    """Those that are read, in time order."""
+    return [stretches[i] for i in sorted(order.numbers)]
 
 
 def _unpooled(
@@ -165,7 +174,9 @@ def read_whole(recording: Recording, params: api.Params) -> State:
     plan = plan_windows(recording)
     iter_windows(recording, plan=plan)
     stretches = cut(recording, plan)
-    state = State(params, find_front_end(stretches, measured=True))
+    exposure = find_exposure(stretches)
+    stretches = exposed(stretches, exposure)
+    state = State(params, find_front_end(stretches, exposure, measured=True))
     simulated = ordered(stretches, "full").simulated
     for i, stretch in enumerate(stretches):
         state = add(state, stretch, simulate=i in simulated)

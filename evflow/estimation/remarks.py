@@ -7,6 +7,7 @@ import numpy as np
 from evflow.camera import Summary
 from evflow.camera.optics import Optics
 from evflow.estimation.refine import Found, Lost
+from evflow.estimation.refine.frame_exposure import Exposure
 from evflow.estimation.shot import Shot
 from evflow.network.pooling import Stats
 from evflow.notes import Note
@@ -103,6 +104,14 @@ def receptor_notes(
             "such light; two real DAVIS had 17 and 20 DN. A longer recording, with dark and bright "
             "areas, determines it."))
     return notes
+
+
+def exposure_notes(exposure: Exposure) -> list[Note]:
+    return [Note(
+        "frames.exposure", f"frames are exposed for {1e3 * exposure.seconds:.0f} ± "
+        f"{1e3 * exposure.std_s:.0f} ms, as what moves is blurred in them and not in the events: "
+        "the blur was taken out (--exposure-ms: the right one, or 0 to leave the blur)."
+    )] if exposure.seconds else []
 
 
 def lost_notes(lost: Lost | None, as_sent: Summary, summary: Summary) -> list[Note]:

@@ -19,6 +19,7 @@ from evflow.errors import EvflowDataError
 from evflow.estimation.finish import Stage
 from evflow.estimation.halves import FirstPart
 from evflow.estimation.pipeline import Progress
+from evflow.estimation.refine.frame_exposure import with_exposure
 from evflow.estimation.result import CameraEstimate
 from evflow.network.weights import load_weights, weights_hash
 from evflow.notes import texts
@@ -125,6 +126,7 @@ def write_report(
         raise EvflowDataError(
             "EV015", f"the estimate is of {size} pixels, the recording of {recording.events.size}.",
             "Pass the recording that the camera was estimated from.")
+    recording = with_exposure(recording, found.optics.exposure_s)
     done = itertools.count(1)
 
     def step() -> None:

@@ -28,6 +28,9 @@ def receptor_panel(found: CameraEstimate, held_out_shares: tuple[float, float] |
              if sensor.cutoff_hz else fast],
             ["light added [DN]", spread(optics.offset_dn, optics.offset_dn_std)],
             ["events after frames [ms]", spread(1e3 * optics.delay_s, 1e3 * optics.delay_s_std)],
+            *([["frames' exposure [ms]", spread(1e3 * optics.exposure_s,
+                                                1e3 * optics.exposure_s_std)]]
+              if optics.exposure_s else []),
             [f"dead time [ms]{LOSS_WORDS[sensor.in_dead_time]}",
              spread(1e3 * sensor.refractory_s, 1e3 * std["refractory_s"])
              if sensor.refractory_s else "not seen"],

@@ -214,7 +214,7 @@ def _halved(recording: Recording, runs: list[Run]) -> tuple[Recording, Run]:
     half = dataclasses.replace(
         recording, events=recording.events.slice(int(times[begin]), int(times[middle])),
         frames=recording.frames[begin:middle + 1], frame_times=times[begin:middle + 1],
-        notes=())
+        notes=tuple(note for note in recording.notes if note.code == "frames.blur"))
     return half, (middle, last)
 
 

@@ -73,6 +73,7 @@ def measured(found: CameraEstimate) -> list[str]:
             ("leak (Hz/pixel)", sensor.leak_hz, std.get("leak_hz", math.nan)),
             ("shot noise (Hz, dark)", sensor.shot_hz, std.get("shot_hz", math.nan)),
             ("light added (DN)", optics.offset_dn, optics.offset_dn_std),
-            ("events after frames (ms)", 1e3 * optics.delay_s, 1e3 * optics.delay_s_std)]
+            ("events after frames (ms)", 1e3 * optics.delay_s, 1e3 * optics.delay_s_std),
+            ("frames' exposure (ms)", 1e3 * optics.exposure_s, 1e3 * optics.exposure_s_std)]
     return [f"{name:22} {spread(value, std):>15}"
             for name, value, std in rows if value and math.isfinite(std)]

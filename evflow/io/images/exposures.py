@@ -23,7 +23,7 @@ LONGEST = 1.05  # an exposure lasts at most the interval between frames; times a
 NAMES = re.compile(r"(?:^|_)exposures?(?:_?times?|_?durations?)?$")  # without the unit
 ENDS = re.compile(r"start|begin"), re.compile(r"end|stop")  # of an exposure, in a name
 NEAR = 0.1  # of an exposure: times that differ by less are the same, rounded
-NOTED = "frames.exposure"
+NOTED, BLURRED = "frames.exposure", "frames.blur"
 FOREVER_US = 2.0**62
 
 
@@ -145,7 +145,7 @@ def exposed_note(exposure_us: int, said_by: str = "as the file says") -> Note:
 def noted(notes: Iterable[Note], exposure_us: int, said_by: str = "") -> tuple[Note, ...]:
     """The notes with this exposure in place of the one they name; without any if it is 0."""
     said = (exposed_note(exposure_us, said_by),) if exposure_us else ()
-    return (*(note for note in notes if note.code != NOTED), *said)
+    return (*(note for note in notes if note.code not in (NOTED, BLURRED)), *said)
 
 
 def given_exposure(
@@ -162,4 +162,6 @@ def given_exposure(
             "Give milliseconds (--exposure-ms), at most the interval between frames; 0 if the "
             "exposure is to be ignored.")
     exposure_us = round(exposure_ms * 1e3)
-    return exposure_us, noted(notes, exposure_us, "as was given")
+    left = () if exposure_us else (Note(BLURRED, "the blur of the frames' exposure, if they have "
+                                        "any, is left in them (--exposure-ms 0)"),)
+    return exposure_us, (*noted(notes, exposure_us, "as was given"), *left)

@@ -1,0 +1,128 @@
+"""The exposure of frames that nobody tells, from what it blurs."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.films import FRAME_S, INTERVALS, integrated, view
+
+from evflow import CameraEstimator, Recording, estimate_camera, read_recording
+from evflow.camera.optics import read_sensor
+from evflow.estimation.refine.frame_exposure import (
+    Exposure,
+    exposed,
+    frame_exposure,
+    is_untold,
+    with_exposure,
+)
+from evflow.estimation.refine.path import STEPS
+from evflow.estimation.refine.stretches import cut
+from evflow.notes import Note
+from evflow.recordings import adjust
+from evflow.recordings.windows import plan_windows
+from evflow.types import Events
+
+STEP_US = 1e6 * FRAME_S / STEPS
+RUN = tuple(range(INTERVALS - 2))
+
+
+def blurred(steps: int, theta: float = 0.1, offset_dn: float = 0.0) -> Recording:
+    """A texture that swings past, its frames exposed for so many steps: one instant and event at a
+    time. Without the film's first and last frame, whose exposure is not in it."""
+    dn = view(2)
+    light = np.cumsum(np.concatenate([np.zeros((1, *dn.shape[1:])), 0.5 * (dn[1:] + dn[:-1])]), 0)
+    middle = np.arange(1, INTERVALS) * STEPS
+    half = steps // 2
+    frames = dn[middle] if not half else (light[middle + half] - light[middle - half]) / (2 * half)
+    path = integrated(dn + offset_dn, FRAME_S / STEPS, 0.0, 0.0, 8)
+    memory, rows = path[0].copy(), []
+    for i, now in enumerate(path):
+        while (crossed := np.abs(now - memory) > theta).any():
+            up = now > memory
+            memory = memory + np.where(up, theta, -theta) * crossed
+            y, x = np.nonzero(crossed)
+            rows.append(np.stack([x, y, np.full(len(x), round(i * STEP_US / 8)), up[crossed]]))
+    x, y, t, p = np.concatenate(rows, 1)
+    return Recording(Events(x, y, t, p > 0, dn.shape[:0:-1]), np.rint(frames).astype(np.uint8),
+                     np.round(middle * STEP_US).astype(np.int64))
+
+
+@pytest.mark.parametrize(("steps", "offset_dn"), [(0, 0.0), (0, 20.0), (8, 0.0), (12, 0.0),
+                                                  (12, 20.0)])
+def test_the_length_that_explains_the_frames_is_theirs(steps: int, offset_dn: float) -> None:
+    """Of 0, 10 and 15 ms, at 20 ms between frames; also where pixels see other light."""
+    found = frame_exposure([(blurred(steps, offset_dn=offset_dn), RUN)])
+    if steps:
+        assert found.seconds == pytest.approx(1e-6 * steps * STEP_US, abs=2.5e-3)
+        assert 2e-3 < found.std_s < 4e-3
+    else:
+        assert found.seconds == 0
+
+
+def test_where_little_happens_between_frames_it_stays_unknown() -> None:
+    assert frame_exposure([(blurred(12, theta=0.8), RUN)]).seconds == 0
+
+
+def test_one_polarity_alone_and_frames_that_stay_say_nothing() -> None:
+    recording = blurred(12)
+    events, on = recording.events, recording.events.p
+    rising = dataclasses.replace(recording, events=Events(
+        events.x[on], events.y[on], events.t[on], on[on], events.size))
+    still = dataclasses.replace(recording, frames=np.full_like(recording.frames, 90))
+    for one in (rising, still):
+        assert frame_exposure([(one, RUN)]).seconds == 0
+
+
+def test_what_is_told_is_not_measured() -> None:
+    recording = blurred(12)
+    left = adjust.exposed(recording, 0.0)
+    made = dataclasses.replace(recording, notes=(Note("frames.made", "by a network"),))
+    assert is_untold(recording)
+    for told in (dataclasses.replace(recording, exposure_us=5000), left, made):
+        assert not is_untold(told)
+        assert frame_exposure([(told, RUN)]) == Exposure()
+    assert is_untold(dataclasses.replace(left, notes=adjust.exposed(left, 5.0).notes))
+    assert [note.code for note in left.notes] == ["frames.blur"]
+
+
+def test_stretches_of_one_recording_still_share_it() -> None:
+    recording = blurred(0)
+    stretches = cut(recording, plan_windows(recording))
+    longer = exposed((*stretches, *stretches), Exposure(0.012, 0.002))
+    assert {s.recording.exposure_us for s in longer} == {12_000}
+    assert len({id(s.recording) for s in longer}) == 1
+    assert exposed(stretches, Exposure()) == tuple(stretches)
+    assert with_exposure(recording, 0.0) is recording
+
+
+def test_an_estimate_takes_the_blur_out_and_says_so(tmp_path: Path) -> None:
+    recording = blurred(12, theta=0.15)
+    found = estimate_camera(recording)
+    assert found.optics.exposure_s == pytest.approx(0.015, abs=2.5e-3)
+    note, = (str(n) for n in found.notes if n.code == "frames.exposure")
+    assert f"{1e3 * found.optics.exposure_s:.0f} ± " in note
+    found.save(tmp_path / "camera.npz")
+    assert read_sensor(tmp_path / "camera.npz")[1].exposure_s == found.optics.exposure_s
+    told = dataclasses.replace(
+        recording, exposure_us=round(1e6 * found.optics.exposure_s))
+    assert estimate_camera(told).summary == found.summary
+    estimator = CameraEstimator()
+    estimator.add(recording)
+    assert estimator.estimate().optics == found.optics
+    ideal = estimate_camera(recording, pixel="ideal")
+    assert ideal.optics.exposure_s == 0
+
+
+def test_of_a_real_camera_it_is_what_its_file_says(data_file: Callable[[str], Path]) -> None:
+    """A DAVIS346 before a Newton's cradle, exposed for 20 ms."""
+    pytest.importorskip("aedat")
+    cradle = read_recording(data_file("data/recordings/newton_cradle_davis346.aedat4"))
+    assert cradle.exposure_us == 20_000
+    untold = dataclasses.replace(cradle, exposure_us=0)
+    runs = [s.run for s in cut(untold, plan_windows(untold))]
+    found = frame_exposure([(untold, run) for run in runs])
+    assert abs(found.seconds - 0.02) < 2 * found.std_s
