@@ -184,8 +184,8 @@ def test_a_camera_at_rest_at_first_is_measured_again_when_it_moves(
     recording, _ = hidden(3)
     measured: list[int] = []
     find = estimator_module.find_front_end
-    monkeypatch.setattr(estimator_module, "find_front_end", lambda on, **k: (
-        measured.append(sum(map(estimator_module._events, on))), find(on, **k))[1])
+    monkeypatch.setattr(estimator_module, "find_front_end", lambda on, *a, **k: (
+        measured.append(sum(map(estimator_module._events, on))), find(on, *a, **k))[1])
     monkeypatch.setattr(estimator_module, "agree", lambda *_: same)
     monkeypatch.setattr(CameraEstimator, "FIRST", 2)
     monkeypatch.setattr(CameraEstimator, "KEPT", 2)

@@ -29,7 +29,7 @@ OFFSETS = (-16.0, -8.0, 0.0, 8.0, 16.0, 26.0, 40.0)  # DN
 SPAN_US = 40_000.0  # longest time between two events over which a signal is interpolated
 BUSY = 4.0  # events between two frames: of fewer the interpolated signal looks smooth itself
 MOST, ENOUGH = 5_000, 500  # changes used of a run; in all
-LEAST_S = 8e-3  # shorter ones are found where there is none: the interpolation is never exact
+LEAST_S = 1e-2  # shorter ones are found where there is none: the interpolation is never exact
 CLEARLY, LEAST_GAIN = 3.0, 0.01  # of log unexplained share: its standard deviations, and at least
 NOTHING = 1e-9
 FLOOR_S = 2.5e-3  # std beside the scatter, of simulated cameras exposed for 10 and 20 ms
@@ -47,10 +47,10 @@ UNSEEN = Exposure()
 
 
 class Busy(NamedTuple):
-    """Where much happens between two frames of a run. times_us: (K + 1,) of the frames. Of pixels
-    with such changes, events (N,) by pixel and time: pixel; on; and since_us, at_us, between which
-    the pixel's signal is interpolated. Changes (M,): where, index of interval and pixel; before,
-    after, DN; block, of the image."""
+    """Where much happens between two frames of a run. times_us: (K + 1,) of the frames; pixels:
+    number of those with such changes. Their events (N,) by pixel and time: pixel; on; and since_us,
+    at_us, between which the pixel's signal is interpolated. Changes (M,): where, index of interval
+    and pixel; before, after, DN; block, of the image."""
 
     times_us: Array
     pixels: int
@@ -74,6 +74,8 @@ def frame_exposure(places: Sequence[Place]) -> Exposure:
         return UNSEEN
     interval = float(np.median(np.concatenate([np.diff(run.times_us) for run in runs])))
     lengths = LENGTHS_US[interval >= LENGTHS_US]
+    if lengths.max(initial=0.0) <= 1e6 * LEAST_S:
+        return UNSEEN
     best = min(10e3, lengths[-1])
     for _ in range(2):
         delay = min(DELAYS_US, key=lambda d: _logs(_products(runs, best, d)).min())
@@ -116,27 +118,41 @@ def _busy(recording: Recording, run: Sequence[int], rng: np.random.Generator) ->
     frames = np.stack([recording.frame_dn(i) for i in [*run, run[-1] + 1]])
     times = recording.frame_times[run[0]:run[-1] + 2].astype(np.float64)
     height, width = frames.shape[1:]
+    pixels = height * width
     events = recording.events.slice(int(times[0] - SPAN_US), int(times[-1] + SPAN_US))
-    pixel = events.y.astype(np.int64) * width + events.x
-    order = np.argsort(pixel, kind="stable")
-    pixel, on, at = pixel[order], events.p[order], events.t[order].astype(np.float64)
-    same = np.diff(pixel, prepend=-1) == 0
-    since = np.maximum(np.where(same, np.roll(at, 1), at), at - SPAN_US)
-    none = np.zeros(0, np.int64)
-    whole = Busy(times, height * width, pixel, on, np.minimum(since, at - 1.0), at,
-                 none, none, none, none)
+    pixel, at = events.y.astype(np.int64) * width + events.x, events.t.astype(np.float64)
+    number = _smooth_numbers(times, at, pixel, pixels)
     shown = np.stack([glitches.exposed(frame) for frame in frames]).reshape(len(frames), -1)
-    number = np.abs(_changes(whole, float(np.diff(times).min()), 0.0)).sum(0)
     where = np.flatnonzero((shown[1:] & shown[:-1]).ravel() & (number > BUSY))
     if len(where) > MOST:
         where = np.sort(rng.choice(where, MOST, replace=False))
-    place = where % (height * width)
-    kept = np.isin(pixel, place)
+    place = where % pixels
+    used, row = np.unique(place, return_inverse=True)
+    row_of = np.full(pixels, -1)
+    row_of[used] = np.arange(len(used))
+    kept = np.flatnonzero(row_of[pixel] >= 0)
+    kept = kept[np.argsort(row_of[pixel[kept]], kind="stable")]
+    pixel, at = row_of[pixel[kept]], at[kept]
+    since = np.where(np.diff(pixel, prepend=-1) == 0, np.roll(at, 1), at)
     light = frames.reshape(len(frames), -1)
     y, x = place // width * TILES[0] // height, place % width * TILES[1] // width
-    return whole._replace(
-        pixel=pixel[kept], on=on[kept], since_us=whole.since_us[kept], at_us=at[kept], where=where,
-        before=light[:-1].ravel()[where], after=light[1:].ravel()[where], block=y * TILES[1] + x)
+    return Busy(times, len(used), pixel, events.p[kept],
+                np.clip(since, at - SPAN_US, at - 1.0), at, where // pixels * len(used) + row,
+                light[:-1].ravel()[where], light[1:].ravel()[where], y * TILES[1] + x)
+
+
+def _smooth_numbers(times: Array, at: Array, pixel: Array, pixels: int) -> Array:
+    """(K * pixels) events between two frames, those near a frame shared with the interval beyond:
+    a choice by whole intervals would prefer events that are early or late in it."""
+    middles = 0.5 * (times[1:] + times[:-1])
+    place = np.interp(at, middles, np.arange(len(middles)), left=-1.0, right=-1.0)
+    inside = np.flatnonzero(place >= 0)
+    first = place[inside].astype(np.int64)
+    later = place[inside] - first
+    slot, size = first * pixels + pixel[inside], len(middles) * pixels
+    number = np.bincount(slot, 1.0 - later, size)
+    number[pixels:] += np.bincount(slot, later, size)[:-pixels]
+    return number
 
 
 def _changes(run: Busy, length_us: float, delay_us: float) -> Array:
