@@ -35,9 +35,12 @@ CLEARLY = 6.0  # log odds required against a pixel that keeps its contrast
 COARSE, FINE = (0.25, 0.5, 0.75, 1.0), np.arange(-0.2, 0.21, 0.05)
 # An offset or a delay of the frames may explain as much as a loss. It is a loss if more than this
 # share of the path changes by a threshold in this part of the shortest intervals: of 128 simulated
-# cameras that lose nothing .001 (.012 where little happens), of 13 that do .006 and more. Less log
-# odds are required then: of those 128 the log odds were 2 at most.
-MISSING, FASTER, PROBABLY = 0.005, 0.7, 2.0
+# cameras that lose nothing .001 (.012 where little happens), of 13 that do .006 and more.
+MISSING, FASTER = 0.005, 0.7
+OPAQUE = 0.3  # unexplained share from which the path is too wrong for that
+# Intervals are longer than this where a pixel hardly has two events. They say nothing of a dead
+# time, but some loss may well seem to explain so few:
+TOO_LONG_S = 1e-2
 NEGLIGIBLE = 0.02  # log units of a threshold, less than what is known of it
 LEAST = 1e-3  # log units, of a threshold
 WAITED, HARDLY = 1.05, 1e-4  # of the dead time; of a weight
@@ -145,12 +148,13 @@ def lost_contrast(
         The search for pixels as they are, with thresholds as if contrast were kept, and how it is
         lost; `found` and None if it is kept.
     """
+    if shortest_s > TOO_LONG_S:
+        return found, None
     size = 0.5 * min(found.size, BELIEVED)
     tried = [way for seen_by in dict.fromkeys((found.ideal, found.used))
              for way in _ways(data, seen_by, shortest_s, sharp=sharp)]
     best = max(tried, key=lambda way: way.gain)
-    too_fast = _too_fast(data, found, FASTER * shortest_s) > MISSING
-    if size * best.gain < (PROBABLY if too_fast else CLEARLY):
+    if size * best.gain < CLEARLY:
         return found, None
     if best.law == "resets":
         finer = best.dead_s + FINE * shortest_s
@@ -159,7 +163,8 @@ def lost_contrast(
     if again is None:
         return found, None
     before, after = (1.0 - f.explained[int(f.needed)] for f in (found, again))
-    if size * np.log(before / after) < CLEARLY and not too_fast:
+    missing = _too_fast(data, found, FASTER * shortest_s) > MISSING
+    if size * np.log(before / after) < CLEARLY and not (missing and before < OPAQUE):
         return found, None
     taken_as_kept, theta = (_solved(some, again.used)[0] for some in (data, best.data))
     if not min(*theta, *taken_as_kept) > LEAST:
