@@ -104,8 +104,8 @@ class Reading:
     flip_frames: Literal["none", "horizontal", "vertical", "both"] = "none"
     """Mirror the frames."""
     exposure_ms: Annotated[float | None, value("MS")] = None
-    """Exposure of the frames, whose blur is taken out; by default what the file says, if it does;
-    0 = none."""
+    """Exposure of the frames, whose blur is taken out; by default what the file says, or what an
+    estimate sees of it; 0 = none."""
     response: Literal["linear", "gamma", "srgb"] = "linear"
     """How the frames encode light; gamma is 2.2. Thresholds refer to linear light."""
     bayer: Annotated[str | None, value("RGGB|BGGR|GRBG|GBRG")] = None

@@ -45,7 +45,7 @@ class CameraEstimate:
             that fast; leak_hz and shot_hz, both part of the camera's eta, 0 if there are fewer
             than 200 such events.
         sensor_std: its standard deviations by field, NaN where nothing was measured.
-        optics: how the frames relate to the light on the pixels: offset and delay.
+        optics: how the frames relate to the light on the pixels: offset, delay and exposure.
         receptor: how both were found: the search for the photoreceptor and what it explains; None
             if nothing was searched for.
         extent: how much of the recording was read, and what more would bring.

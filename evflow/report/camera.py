@@ -43,13 +43,7 @@ from evflow.report.resimulate import (
     resimulate,
     usable_runs,
 )
-from evflow.report.streams import (
-    count_panel,
-    image_panel,
-    rate_panel,
-    time_panel,
-    verdict_rows,
-)
+from evflow.report.streams import count_panel, image_panel, rate_panel, time_panel, verdict_rows
 from evflow.report.verdict import (
     HEADLINES,
     RULE,

@@ -23,9 +23,10 @@ from evflow.types import Recording
 
 Array = np.ndarray
 
-LENGTHS_US = 1e3 * np.array([0.5, 4.0, 8.0, 12.0, 16.0, 20.0, 25.0, 30.0, 35.0, 40.0])
+LENGTHS_US = 1e3 * np.array([0.5, 4.0, 8.0, 12.0, 16.0, 20.0, 25.0, 30.0, 35.0, 40.0, 50.0])
 DELAYS_US = 1e3 * np.arange(-6.0, 11.0, 2.0)  # of events after frames: slow pixels, and clocks
 OFFSETS = (-16.0, -8.0, 0.0, 8.0, 16.0, 26.0, 40.0)  # DN
+BEYOND = 1.3  # times the interval between frames, so that an exposure as long as that is inside
 SPAN_US = 40_000.0  # longest time between two events over which a signal is interpolated
 BUSY = 4.0  # events between two frames: of fewer the interpolated signal looks smooth itself
 MOST, ENOUGH = 5_000, 500  # changes used of a run; in all
@@ -73,7 +74,7 @@ def frame_exposure(places: Sequence[Place]) -> Exposure:
     if sum(len(run.where) for run in runs) < ENOUGH:
         return UNSEEN
     interval = float(np.median(np.concatenate([np.diff(run.times_us) for run in runs])))
-    lengths = LENGTHS_US[interval >= LENGTHS_US]
+    lengths = LENGTHS_US[BEYOND * interval >= LENGTHS_US]
     if lengths.max(initial=0.0) <= 1e6 * LEAST_S:
         return UNSEEN
     best = min(10e3, lengths[-1])
@@ -89,7 +90,8 @@ def frame_exposure(places: Sequence[Place]) -> Exposure:
     scatter, error = np.sqrt((len(used) - 1) * found.var(0))
     seen = (best >= 1e6 * LEAST_S and best < lengths[-1] and gain > LEAST_GAIN
             and gain > CLEARLY * error)
-    return Exposure(1e-6 * best, float(np.hypot(1e-6 * scatter, FLOOR_S))) if seen else UNSEEN
+    seconds, std_s = 1e-6 * min(best, interval), float(np.hypot(1e-6 * scatter, FLOOR_S))
+    return Exposure(seconds, std_s) if seen else UNSEEN
 
 
 def exposed(stretches: Sequence[Stretch], exposure: Exposure) -> tuple[Stretch, ...]:
