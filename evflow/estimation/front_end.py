@@ -66,12 +66,12 @@ def find_front_end(
                                       sharp=dead.measured) if measured else (None, None))
     blur_s = 1e-6 * float(np.mean([recording.exposure_us for recording, _ in runs]))
     seen_by = found.used if found else IDEAL
-    return FrontEnd(seen_by, noise_dn, blur_s, found, begun_anew(dead, lost), lost, faulty, films,
+    return FrontEnd(seen_by, noise_dn, blur_s, found, settled(dead, lost), lost, faulty, films,
                     exposure)
 
 
-def begun_anew(dead: DeadTime, lost: Lost | None) -> DeadTime:
-    """The dead time of pixels that lose contrast in it: it is shorter than their intervals."""
+def settled(dead: DeadTime, lost: Lost | None) -> DeadTime:
+    """The dead time, given what is lost in it: shorter than the intervals of pixels that lose."""
     if lost is None or lost.law == "keeps":
         return dead
     return DeadTime(lost.dead_s, lost.std_s)

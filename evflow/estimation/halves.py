@@ -14,7 +14,7 @@ import numpy as np
 
 from evflow.estimation.dead_time import dead_time, first_events
 from evflow.estimation.finish import estimate
-from evflow.estimation.front_end import begun_anew
+from evflow.estimation.front_end import settled
 from evflow.estimation.refine import Stretch, find_photoreceptor, make_chunk, simulated_part
 from evflow.estimation.refine.path import STEPS
 from evflow.estimation.refine.photoreceptor import receptor_places
@@ -89,7 +89,7 @@ def _on_its_own(first: FirstPart) -> State:
             runs, front_end.noise_dn, shortest_s=dead.shortest_s, sharp=dead.measured)
     seen_by = found.used if found is not None else IDEAL
     own = dataclasses.replace(front_end, seen_by=seen_by, found=found,
-                              dead=begun_anew(dead, lost), lost=lost, films={})
+                              dead=settled(dead, lost), lost=lost, films={})
     simulated = spread([len(s.run) for s in state.read], max(len(state.chunks), 1))
     if seen_by != front_end.seen_by:
         state = State(state.params, own)
