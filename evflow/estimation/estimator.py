@@ -21,7 +21,7 @@ from evflow.estimation.front_end import (
 )
 from evflow.estimation.pipeline import check_options
 from evflow.estimation.refine import Stretch, cut
-from evflow.estimation.refine.frame_exposure import UNSEEN, Exposure, exposed
+from evflow.estimation.refine.frame_exposure import UNSEEN, Exposure, with_exposures
 from evflow.estimation.refine.stretches import most_simulated, spread
 from evflow.estimation.result import CameraEstimate
 from evflow.estimation.state import State, add, thinned
@@ -39,8 +39,8 @@ class CameraEstimator:
     """Measure a camera while it records: add pieces of a recording, ask for the estimate so far.
 
     Only sums and a bounded number of pieces are kept: memory is bounded by the size of the sensor.
-    The photoreceptor and the frames' offset are measured from the first pieces, and again from the
-    busiest when these have twice the events. If they differ, what is kept is read again, and
+    The photoreceptor and the frames' offset and exposure are measured from the first pieces, and
+    again from the busiest when these have twice the events. If they differ, what is kept is read again, and
     `.extent` says how much that is. If one recording is added whole, the estimate equals
     `estimate_camera(recording, effort="full")`.
 
@@ -137,7 +137,7 @@ class CameraEstimator:
                 self._state = self._begun()
                 self._waiting = ()
         else:
-            for stretch in exposed(stretches, self._state.front_end.exposure):
+            for stretch in with_exposures(stretches, self._state.front_end.exposure):
                 self._state = self._next(self._state, stretch)
             if sum(map(_events, self._busiest)) > self.AGAIN * self._measured:
                 self._state = self._again(self._state)
@@ -183,11 +183,12 @@ class CameraEstimator:
         stretches that are kept."""
         self._measured = sum(map(_events, self._busiest))
         exposure = self._exposure(self._busiest)
-        exposure = exposure if exposure.seconds else state.front_end.exposure
-        of_span = {s.span_us: s for s in (*state.read, *self._busiest)}
-        stretches = exposed([of_span[span] for span in sorted(of_span)], exposure)
-        busiest = {s.span_us for s in self._busiest}
-        front_end = self._front_end([s for s in stretches if s.span_us in busiest], exposure)
+        before = state.front_end.exposure
+        exposure = exposure if exposure.seconds else before
+        kept = {_place(s): s for s in (*state.read, *self._busiest)}
+        stretches = with_exposures([kept[place] for place in sorted(kept)], exposure, before)
+        busiest = {_place(s) for s in self._busiest}
+        front_end = self._front_end([s for s in stretches if _place(s) in busiest], exposure)
         if agree(state.front_end, front_end):
             return dataclasses.replace(
                 state, front_end=with_dead_time(state.front_end, front_end))
@@ -198,7 +199,7 @@ class CameraEstimator:
     def _begun(self) -> State:
         """The state of the stretches that wait."""
         exposure = self._exposure(self._waiting)
-        stretches = exposed(self._waiting, exposure)
+        stretches = with_exposures(self._waiting, exposure)
         return self._read(stretches, self._front_end(stretches, exposure))
 
     def _exposure(self, stretches: Sequence[Stretch]) -> Exposure:
@@ -227,6 +228,11 @@ class CameraEstimator:
             self._apart *= 2
         return add(thinned(state, most if wanted else most + 1, self.KEPT), stretch,
                    simulate=wanted)
+
+
+def _place(stretch: Stretch) -> tuple[tuple[int, int], int]:
+    """What a stretch shares with itself under another exposure: its span, and the piece."""
+    return stretch.span_us, id(stretch.recording.events)
 
 
 def _events(stretch: Stretch) -> int:

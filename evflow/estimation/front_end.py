@@ -24,10 +24,9 @@ from evflow.simulator.photoreceptor import IDEAL, Photoreceptor
 class FrontEnd:
     """seen_by: how the pixels see what the frames show; noise_dn, blur_s: the frames' noise in DN
     and their exposure, 0 if it is unknown; found: the search for the photoreceptor, None if there
-    was none; dead: the dead time; lost: the contrast that pixels lose in it, None if they keep it;
-    faulty: (H, W) bool, pixels that fire alone or never, None if
-    there are none; films: of stretches that are still to be read; exposure: of the frames, as their
-    blur shows."""
+    was none; dead: the dead time; lost: the contrast that pixels lose in it, None if they send it
+    all; faulty: (H, W) bool, pixels that fire alone or never, None if there are none; films: of
+    stretches that are still to be read; exposure: of the frames, if it was measured."""
 
     seen_by: Photoreceptor = IDEAL
     noise_dn: float = 0.0
@@ -100,7 +99,9 @@ def with_dead_time(before: FrontEnd, now: FrontEnd) -> FrontEnd:
 
 def _same(before: Exposure, now: Exposure) -> bool:
     """As `agree`, of the exposure."""
-    return not now.seconds or abs(before.seconds - now.seconds) <= 2.0 * now.std_s
+    if not (before.seconds and now.seconds):
+        return not now.seconds
+    return abs(before.seconds - now.seconds) <= 2.0 * now.std_s
 
 
 def _faulty(stretches: Sequence[Stretch]) -> np.ndarray | None:

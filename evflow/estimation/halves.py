@@ -77,7 +77,8 @@ def divided(stretches: Sequence[Stretch]) -> Division | None:
 
 
 def _on_its_own(first: FirstPart) -> State:
-    """The state with photoreceptor and dead time as measured on the first part itself."""
+    """The state with photoreceptor and dead time as measured on the first part itself; the frames'
+    exposure stays that of the whole."""
     state, front_end = first.state, first.state.front_end
     runs, searched = ([(s.recording, s.run) for s in part] for part in (state.read, first.searched))
     events = state.read[0].recording.events

@@ -28,7 +28,7 @@ from evflow.estimation.front_end import find_exposure, find_front_end
 from evflow.estimation.halves import FirstPart, divided
 from evflow.estimation.reading import BATCH, BUDGETS, EFFORTS, Effort, Order, gain, ordered
 from evflow.estimation.refine import Stretch, cut, pixel_posterior
-from evflow.estimation.refine.frame_exposure import UNSEEN, exposed
+from evflow.estimation.refine.frame_exposure import UNSEEN, with_exposures
 from evflow.estimation.result import CameraEstimate
 from evflow.estimation.state import State, add, read_stretch, summary_so_far
 from evflow.estimation.static import estimate_noise
@@ -64,8 +64,9 @@ def estimate_camera(
             pixels separately, the maps are the mean over windows, which are shorter (25 ms at
             least), and standard deviations are NaN.
         refine: "auto" corrects the network's estimate by simulation (error of theta .022 to .010).
-        pixel: "measured" measures the photoreceptor and the frames' offset; "ideal" assumes ideal
-            pixels and frames.
+        pixel: "measured" measures the photoreceptor, and the frames' offset and exposure (unless
+            the recording has one, or `recordings.adjust.exposed(recording, 0)` leaves the blur);
+            "ideal" assumes ideal pixels and frames.
         effort: how much is read. "normal": of a long recording, stretches spread over it, until the
             errors stop shrinking or a minute's work is done (DAVIS346); "quick": a third of that;
             "full": everything. `.extent` of the result says how much was read, and what more would
@@ -132,7 +133,7 @@ def measure(
     stage("looking for the photoreceptor")
     measured = pixel == "measured"
     exposure = find_exposure(_used(stretches, order)) if measured else UNSEEN
-    stretches = exposed(stretches, exposure)
+    stretches = with_exposures(stretches, exposure)
     used = _used(stretches, order)
     state = State(params, find_front_end(used, exposure, measured=measured))
     counter = ProgressCounter(used, progress)
@@ -175,7 +176,7 @@ def read_whole(recording: Recording, params: api.Params) -> State:
     iter_windows(recording, plan=plan)
     stretches = cut(recording, plan)
     exposure = find_exposure(stretches)
-    stretches = exposed(stretches, exposure)
+    stretches = with_exposures(stretches, exposure)
     state = State(params, find_front_end(stretches, exposure, measured=True))
     simulated = ordered(stretches, "full").simulated
     for i, stretch in enumerate(stretches):

@@ -19,6 +19,7 @@ from evflow.errors import EvflowDataError
 from evflow.estimation.halves import FirstPart
 from evflow.estimation.pipeline import estimate_camera
 from evflow.estimation.refine import frame_noise, receptor_sample
+from evflow.estimation.refine.frame_exposure import TELLING, with_exposure
 from evflow.estimation.refine.lost_contrast import without_waiting
 from evflow.estimation.refine.receptor_search import explained
 from evflow.estimation.refine.stretches import INTERVALS
@@ -198,6 +199,9 @@ def held_out(
     else:
         half, rest = _halved(recording, runs)
         found = estimate_camera(half, params, min_window_us=min_window_us)
+        if found.optics.exposure_s:
+            recording = with_exposure(recording, found.optics.exposure_s)
+            pictures = None
     trial = resimulate(recording, found, busiest(recording, [rest]), seed, pictures)
     return found, trial, held_out_shares(recording, found, rest)
 
@@ -214,7 +218,7 @@ def _halved(recording: Recording, runs: list[Run]) -> tuple[Recording, Run]:
     half = dataclasses.replace(
         recording, events=recording.events.slice(int(times[begin]), int(times[middle])),
         frames=recording.frames[begin:middle + 1], frame_times=times[begin:middle + 1],
-        notes=tuple(note for note in recording.notes if note.code == "frames.blur"))
+        notes=tuple(note for note in recording.notes if note.code in TELLING))
     return half, (middle, last)
 
 

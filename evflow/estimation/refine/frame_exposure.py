@@ -17,9 +17,10 @@ import numpy as np
 from evflow.estimation.refine.path import Place
 from evflow.estimation.refine.receptor_data import TILES
 from evflow.estimation.refine.stretches import Stretch
+from evflow.io.images.exposures import BLURRED
 from evflow.light.log_maps import log64
 from evflow.recordings import glitches
-from evflow.types import Recording
+from evflow.types import Recording, release
 
 Array = np.ndarray
 
@@ -32,7 +33,9 @@ BUSY = 4.0  # events between two frames: of fewer the interpolated signal looks 
 MOST, ENOUGH = 5_000, 500  # changes used of a run; in all
 LEAST_S = 1e-2  # shorter ones are found where there is none: the interpolation is never exact
 CLEARLY, LEAST_GAIN = 3.0, 0.01  # of log unexplained share: its standard deviations, and at least
-NOTHING = 1e-9
+TELLING = (BLURRED, "frames.dense")  # notes of recordings in which it is not to be measured
+NOTHING = 1e-9  # of the sums, so that one polarity alone, or no change, can be solved
+FEWEST = 4  # tiles, over which a gain's scatter says something
 FLOOR_S = 2.5e-3  # std beside the scatter, of simulated cameras exposed for 10 and 20 ms
 
 
@@ -71,6 +74,8 @@ def frame_exposure(places: Sequence[Place]) -> Exposure:
         return UNSEEN
     rng = np.random.default_rng(0)
     runs = [_busy(recording, run, rng) for recording, run in places]
+    for recording, _ in places:
+        release(recording)
     if sum(len(run.where) for run in runs) < ENOUGH:
         return UNSEEN
     interval = float(np.median(np.concatenate([np.diff(run.times_us) for run in runs])))
@@ -85,6 +90,8 @@ def frame_exposure(places: Sequence[Place]) -> Exposure:
         best, _ = _least(lengths, _logs(table[:, offset]))
     of_blocks = table[:, offset]
     used = np.flatnonzero(np.trace(of_blocks[0], axis1=1, axis2=2))
+    if len(used) < FEWEST or delay in DELAYS_US[[0, -1]]:
+        return UNSEEN
     found = np.array([_least(lengths, _logs(np.delete(of_blocks, b, 1))) for b in used])
     _, gain = _least(lengths, _logs(of_blocks))
     scatter, error = np.sqrt((len(used) - 1) * found.var(0))
@@ -94,29 +101,35 @@ def frame_exposure(places: Sequence[Place]) -> Exposure:
     return Exposure(seconds, std_s) if seen else UNSEEN
 
 
-def exposed(stretches: Sequence[Stretch], exposure: Exposure) -> tuple[Stretch, ...]:
-    """The stretches, with recordings that have this exposure, if it was measured."""
-    if not exposure.seconds:
-        return tuple(stretches)
-    of = {id(s.recording): s.recording for s in stretches}
-    lengthened = {key: with_exposure(recording, exposure.seconds) for key, recording in of.items()}
-    return tuple(dataclasses.replace(s, recording=lengthened[id(s.recording)]) for s in stretches)
+def with_exposures(
+    stretches: Sequence[Stretch], exposure: Exposure, before: Exposure = UNSEEN
+) -> tuple[Stretch, ...]:
+    """The stretches, with `with_exposure` of their recordings, one of each. before: what they have
+    of an earlier measurement, which this replaces."""
+    recordings = {id(s.recording): s.recording for s in stretches}
+    changed = {key: with_exposure(recording, exposure.seconds, before.seconds)
+               for key, recording in recordings.items()}
+    return tuple(dataclasses.replace(s, recording=changed[id(s.recording)]) for s in stretches)
 
 
-def with_exposure(recording: Recording, seconds: float) -> Recording:
-    """The recording, with a measured exposure of its frames, 0 if there is none."""
-    if not seconds:
+def with_exposure(recording: Recording, seconds: float, before_s: float = 0.0) -> Recording:
+    """The recording with a measured exposure of its frames, if there is one and no other is told.
+    before_s: an earlier measured one."""
+    earlier = before_s and recording.exposure_us == round(1e6 * before_s)
+    if not seconds or not (earlier or is_untold(recording)):
         return recording
     return dataclasses.replace(recording, exposure_us=round(1e6 * seconds))
 
 
 def is_untold(recording: Recording) -> bool:
-    """Whether neither a file nor the user says how long the frames were exposed."""
-    left = any(note.code == "frames.blur" for note in recording.notes)
-    return not (recording.exposure_us or left or recording.frames_were_made)
+    """Whether neither a file nor the user says how long the frames were exposed, and it can be
+    long: of frames that come faster than an estimate uses it cannot."""
+    told = any(note.code in TELLING for note in recording.notes)
+    return not (recording.exposure_us or told or recording.frames_were_made)
 
 
 def _busy(recording: Recording, run: Sequence[int], rng: np.random.Generator) -> Busy:
+    """Of a run of frame intervals, at most MOST changes."""
     frames = np.stack([recording.frame_dn(i) for i in [*run, run[-1] + 1]])
     times = recording.frame_times[run[0]:run[-1] + 2].astype(np.float64)
     height, width = frames.shape[1:]
@@ -186,23 +199,25 @@ def _products(runs: Sequence[Busy], length_us: float, delay_us: float) -> Array:
     found = []
     for run in runs:
         on, off = _changes(run, length_us, delay_us)[:, run.where]
-        for_run = []
+        of_offsets = []
         for offset in OFFSETS:
             before, after = (log64(np.maximum(dn + offset, 0.0), "linlog")
                              for dn in (run.before, run.after))
             columns = on, -off, after - before
-            for_run.append(np.stack([[np.bincount(run.block, a * b, TILES[0] * TILES[1])
-                                      for a in columns] for b in columns]))
-        found.append(np.moveaxis(np.stack(for_run), -1, 1))
+            of_offsets.append(np.stack([[np.bincount(run.block, a * b, TILES[0] * TILES[1])
+                                         for a in columns] for b in columns]))
+        found.append(np.moveaxis(np.stack(of_offsets), -1, 1))
     return np.concatenate(found, 1)
 
 
 def _logs(products: Array) -> Array:
     """Log of the unexplained share, of products (..., blocks, 3, 3)."""
-    total = products.sum(-3) + NOTHING * np.eye(3)  # there may be one polarity alone, or no change
+    total = products.sum(-3)
+    size = NOTHING * (1.0 + np.trace(total, axis1=-2, axis2=-1))
+    total = total + size[..., None, None] * np.eye(3)
     theta = np.linalg.solve(total[..., :2, :2], total[..., :2, 2:])[..., 0]
     left = total[..., 2, 2] - (theta * total[..., :2, 2]).sum(-1)
-    return np.log(np.maximum(left / total[..., 2, 2], 1e-9))
+    return np.log(np.maximum(left / total[..., 2, 2], NOTHING))
 
 
 def _least(lengths: Array, logs: Array) -> tuple[float, float]:

@@ -88,7 +88,7 @@ def kept_contrast(data: Sample, found: Found, dead_s: float) -> Lost | None:
     """How many events fewer pixels send that keep the contrast of their dead time: ON and OFF of it
     may cancel, and what is owed at last is never sent. None if that is negligible, or unknown: too
     few events, or thresholds that are none."""
-    if not min(found.theta) > LEAST:
+    if not np.min(found.theta) > LEAST:
         return None
     excess = np.ones(2)
     dead, free = (SensorModel(log_map="log_eps", refractory_s=s) for s in (dead_s, 0.0))
@@ -163,11 +163,11 @@ def lost_contrast(
     if again is None:
         return found, None
     before, after = (1.0 - f.explained[int(f.needed)] for f in (found, again))
-    missing = _too_fast(data, found, FASTER * shortest_s) > MISSING
-    if size * np.log(before / after) < CLEARLY and not (missing and before < OPAQUE):
+    if size * np.log(before / after) < CLEARLY and not (
+            before < OPAQUE and _too_fast(data, found, FASTER * shortest_s) > MISSING):
         return found, None
     taken_as_kept, theta = (_solved(some, again.used)[0] for some in (data, best.data))
-    if not min(*theta, *taken_as_kept) > LEAST:
+    if not np.min([theta, taken_as_kept]) > LEAST:
         return found, None
     excess = taken_as_kept / theta
     if np.abs(np.log(excess)).max() < NEGLIGIBLE:

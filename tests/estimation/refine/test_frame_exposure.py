@@ -12,12 +12,14 @@ from helpers.films import FRAME_S, INTERVALS, integrated, view
 
 from evflow import CameraEstimator, Recording, estimate_camera, read_recording
 from evflow.camera.optics import read_sensor
+from evflow.estimation.refine import frame_exposure as frame_exposure_module
 from evflow.estimation.refine.frame_exposure import (
+    UNSEEN,
     Exposure,
-    exposed,
     frame_exposure,
     is_untold,
     with_exposure,
+    with_exposures,
 )
 from evflow.estimation.refine.path import STEPS
 from evflow.estimation.refine.stretches import cut
@@ -63,6 +65,29 @@ def test_the_length_that_explains_the_frames_is_theirs(steps: int, offset_dn: fl
         assert found.seconds == 0
 
 
+def test_a_delay_beyond_the_search_is_no_exposure() -> None:
+    """Of frames on another clock, 12 ms late: an exposure of 17 ms seemed to explain them."""
+    recording = blurred(0)
+    late = dataclasses.replace(recording, frame_times=recording.frame_times + 12_000)
+    assert frame_exposure([(late, RUN)]) == UNSEEN
+
+
+def test_a_single_place_says_nothing() -> None:
+    """The scatter over tiles is the test of a gain."""
+    recording = blurred(12)
+    events = recording.events
+    corner = (events.x < 8) & (events.y < 8)
+    one = dataclasses.replace(recording, events=Events(
+        *(getattr(events, name)[corner] for name in "xytp"), events.size))
+    assert frame_exposure([(one, RUN)]) == UNSEEN
+    assert frame_exposure([(one, RUN)] * 4) != UNSEEN  # as if of four tiles
+
+
+def test_every_event_twice_can_be_solved() -> None:
+    on = np.array([[1e8, 1e8, 0.0], [1e8, 1e8, 0.0], [0.0, 0.0, 1e8]])
+    assert np.isfinite(frame_exposure_module._logs(on[None]))
+
+
 def test_where_little_happens_between_frames_it_stays_unknown() -> None:
     assert frame_exposure([(blurred(12, theta=0.8), RUN)]).seconds == 0
 
@@ -84,7 +109,7 @@ def test_what_is_told_is_not_measured() -> None:
     assert is_untold(recording)
     for told in (dataclasses.replace(recording, exposure_us=5000), left, made):
         assert not is_untold(told)
-        assert frame_exposure([(told, RUN)]) == Exposure()
+        assert frame_exposure([(told, RUN)]) == UNSEEN
     assert is_untold(dataclasses.replace(left, notes=adjust.exposed(left, 5.0).notes))
     assert [note.code for note in left.notes] == ["frames.blur"]
 
@@ -92,11 +117,15 @@ def test_what_is_told_is_not_measured() -> None:
 def test_stretches_of_one_recording_still_share_it() -> None:
     recording = blurred(0)
     stretches = cut(recording, plan_windows(recording))
-    longer = exposed((*stretches, *stretches), Exposure(0.012, 0.002))
+    longer = with_exposures((*stretches, *stretches), Exposure(0.012, 0.002))
     assert {s.recording.exposure_us for s in longer} == {12_000}
     assert len({id(s.recording) for s in longer}) == 1
-    assert exposed(stretches, Exposure()) == tuple(stretches)
+    assert all(s.recording is recording for s in with_exposures(stretches, UNSEEN))
     assert with_exposure(recording, 0.0) is recording
+    assert [s.recording.exposure_us for s in with_exposures(
+        longer[:1], Exposure(0.015, 0.002), before=Exposure(0.012, 0.002))] == [15_000]
+    for told in (adjust.exposed(recording, 5.0), adjust.exposed(recording, 0.0)):
+        assert with_exposure(told, 0.012) is told
 
 
 def test_an_estimate_takes_the_blur_out_and_says_so(tmp_path: Path) -> None:

@@ -351,7 +351,7 @@ def test_too_few_events_and_no_thresholds_say_nothing_of_what_is_never_sent() ->
     dn, dt_s = view(), FRAME_S / STEPS
     data = sample_of(dn, dead_events(integrated(dn, dt_s, 0.0, 0.0, SUB), dt_s / SUB, "keeps"))
     found = find(without_waiting(data, DEAD_S))
-    for theta in ([np.nan, 0.2], [-0.1, 0.2], [0.25, 50.0]):
+    for theta in ([np.nan, 0.2], [0.2, np.nan], [-0.1, 0.2], [0.25, 50.0]):
         other = dataclasses.replace(found, theta=np.array(theta))
         assert kept_contrast(data, other, DEAD_S) is None
 
