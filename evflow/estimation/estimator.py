@@ -40,8 +40,8 @@ class CameraEstimator:
 
     Only sums and a bounded number of pieces are kept: memory is bounded by the size of the sensor.
     The photoreceptor and the frames' offset and exposure are measured from the first pieces, and
-    again from the busiest when these have twice the events. If they differ, what is kept is read again, and
-    `.extent` says how much that is. If one recording is added whole, the estimate equals
+    again from the busiest when these have twice the events. If they differ, what is kept is read
+    again, and `.extent` says how much that is. If one recording is added whole, the estimate equals
     `estimate_camera(recording, effort="full")`.
 
     Args:
