@@ -58,7 +58,7 @@ def find_front_end(
     faulty = _faulty(stretches)
     runs = [(s.recording, s.run) for s in stretches if s.run]
     if not runs:
-        return FrontEnd(dead=dead, faulty=faulty)
+        return FrontEnd(dead=dead, faulty=faulty, exposure=exposure)
     noise_dn = frame_noise([(recording, i) for recording, run in runs for i in run])
     films: Films = {}
     found, lost = (find_photoreceptor(runs, noise_dn, films, shortest_s=dead.shortest_s,

@@ -15,6 +15,7 @@ from evflow.estimation import estimator as estimator_module
 from evflow.estimation.extent import covered_s
 from evflow.estimation.front_end import FrontEnd
 from evflow.estimation.refine import stretches as cutting
+from evflow.estimation.refine.frame_exposure import UNSEEN, Exposure
 from evflow.estimation.state import State, thinned
 from evflow.types import Events
 
@@ -175,6 +176,29 @@ def sparse(recording: Recording, share: float) -> Recording:
     e, kept = recording.events, np.random.default_rng(0).random(len(recording.events)) < share
     return dataclasses.replace(
         recording, events=Events(e.x[kept], e.y[kept], e.t[kept], e.p[kept], e.size))
+
+
+def test_an_exposure_that_is_seen_later_is_that_of_all_that_is_kept(
+    monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where it changes: what was measured before is not told."""
+    recording, _ = hidden(3)
+    seen = iter([UNSEEN, Exposure(0.012, 0.002), Exposure(0.015, 0.002), UNSEEN])
+    find, exposures = estimator_module.find_front_end, []
+    monkeypatch.setattr(estimator_module, "find_exposure", lambda _: next(seen))
+    monkeypatch.setattr(estimator_module, "find_front_end", lambda on, *a, **k: (
+        exposures.append({s.recording.exposure_us for s in on}), find(on, *a, **k))[1])
+    monkeypatch.setattr(estimator_module, "agree", lambda *_: False)
+    monkeypatch.setattr(CameraEstimator, "FIRST", 1)
+    monkeypatch.setattr(CameraEstimator, "AGAIN", 0.0)
+    estimator = CameraEstimator(refine="off")
+    for first in range(4):
+        estimator.add(piece(recording, first, first + 1))
+        state = estimator._state
+        assert state is not None
+        assert {s.recording.exposure_us for s in state.read} == exposures[-1]
+    assert exposures == [{0}, {12_000}, {15_000}, {15_000}]
+    assert estimator.estimate().optics.exposure_s == 0.015
 
 
 @pytest.mark.parametrize("same", [False, True])
