@@ -20,6 +20,9 @@ from evflow.recordings.faulty_pixels import dead_pixels, hot_among_neighbours
 from evflow.simulator.photoreceptor import IDEAL, Photoreceptor
 
 
+WAITING_S = 2e-3  # dead time from which events that wait for it come noticeably late
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class FrontEnd:
     """seen_by: how the pixels see what the frames show; noise_dn, blur_s: the frames' noise in DN
@@ -45,8 +48,12 @@ class FrontEnd:
 
 
 def find_exposure(stretches: Sequence[Stretch]) -> Exposure:
-    """The exposure of the frames, where nobody says it and their blur shows it."""
-    return frame_exposure(receptor_places([(s.recording, s.run) for s in stretches if s.run]))
+    """The exposure of the frames, where nobody says it and their blur shows it. Events that wait
+    for a long dead time are as if blurred themselves: there it is not known."""
+    found = frame_exposure(receptor_places([(s.recording, s.run) for s in stretches if s.run]))
+    if found.seconds and _dead_time(stretches).seconds > WAITING_S:
+        return UNSEEN
+    return found
 
 
 def find_front_end(
@@ -54,7 +61,7 @@ def find_front_end(
 ) -> FrontEnd:
     """Measure the front end on some stretches of a recording. exposure: as measured, if the
     recordings have it. measured: False assumes ideal pixels."""
-    dead = dead_time(first_events(max((s.recording.events for s in stretches), key=len)))
+    dead = _dead_time(stretches)
     faulty = _faulty(stretches)
     runs = [(s.recording, s.run) for s in stretches if s.run]
     if not runs:
@@ -95,6 +102,10 @@ def with_dead_time(before: FrontEnd, now: FrontEnd) -> FrontEnd:
     if before.law != "keeps" or not now.dead.measured:
         return before
     return dataclasses.replace(before, dead=now.dead)
+
+
+def _dead_time(stretches: Sequence[Stretch]) -> DeadTime:
+    return dead_time(first_events(max((s.recording.events for s in stretches), key=len)))
 
 
 def _same(before: Exposure, now: Exposure) -> bool:

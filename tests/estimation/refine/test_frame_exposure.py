@@ -12,6 +12,8 @@ from helpers.films import FRAME_S, INTERVALS, integrated, view
 
 from evflow import CameraEstimator, Recording, estimate_camera, read_recording
 from evflow.camera.optics import read_sensor
+from evflow.estimation import front_end
+from evflow.estimation.dead_time import DeadTime
 from evflow.estimation.refine import frame_exposure as frame_exposure_module
 from evflow.estimation.refine.frame_exposure import (
     UNSEEN,
@@ -143,6 +145,14 @@ def test_an_estimate_takes_the_blur_out_and_says_so(tmp_path: Path) -> None:
     assert estimator.estimate().optics == found.optics
     ideal = estimate_camera(recording, pixel="ideal")
     assert ideal.optics.exposure_s == 0
+
+
+def test_events_that_wait_are_not_taken_for_a_blur(monkeypatch: pytest.MonkeyPatch) -> None:
+    recording = blurred(12)
+    stretches = cut(recording, plan_windows(recording))
+    assert front_end.find_exposure(stretches).seconds > 0.01
+    monkeypatch.setattr(front_end, "dead_time", lambda _: DeadTime(5e-3, 1e-4))
+    assert front_end.find_exposure(stretches) == UNSEEN
 
 
 def test_of_a_real_camera_it_is_what_its_file_says(data_file: Callable[[str], Path]) -> None:
