@@ -19,7 +19,6 @@ from evflow.estimation.refine.photoreceptor import STRETCHES, receptor_places
 from evflow.recordings.faulty_pixels import dead_pixels, hot_among_neighbours
 from evflow.simulator.photoreceptor import IDEAL, Photoreceptor
 
-
 WAITING_S = 2e-3  # dead time from which events that wait for it come noticeably late
 
 
