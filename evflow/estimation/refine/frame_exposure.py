@@ -82,9 +82,12 @@ def frame_exposure(places: Sequence[Place]) -> Exposure:
     lengths = LENGTHS_US[BEYOND * interval >= LENGTHS_US]
     if lengths.max(initial=0.0) <= 1e6 * LEAST_S:
         return UNSEEN
-    best = min(10e3, lengths[-1])
+    best, delay = min(10e3, lengths[-1]), np.nan
     for _ in range(2):
+        before = delay
         delay = min(DELAYS_US, key=lambda d: _logs(_products(runs, best, d)).min())
+        if delay == before:
+            break
         table = np.stack([_products(runs, length, delay) for length in lengths])
         offset = int(np.argmin(_logs(table).min(0)))
         best, _ = _least(lengths, _logs(table[:, offset]))
@@ -147,13 +150,31 @@ def _busy(recording: Recording, run: Sequence[int], rng: np.random.Generator) ->
     row_of[used] = np.arange(len(used))
     kept = np.flatnonzero(row_of[pixel] >= 0)
     kept = kept[np.argsort(row_of[pixel[kept]], kind="stable")]
-    pixel, at = row_of[pixel[kept]], at[kept]
+    pixel, on, at = row_of[pixel[kept]], events.p[kept], at[kept]
     since = np.where(np.diff(pixel, prepend=-1) == 0, np.roll(at, 1), at)
+    since = np.clip(since, at - SPAN_US, at - 1.0)
+    where = where // pixels * len(used) + row
+    near = _near(times, len(used), where, pixel, since, at)
     light = frames.reshape(len(frames), -1)
     y, x = place // width * TILES[0] // height, place % width * TILES[1] // width
-    return Busy(times, len(used), pixel, events.p[kept],
-                np.clip(since, at - SPAN_US, at - 1.0), at, where // pixels * len(used) + row,
-                light[:-1].ravel()[where], light[1:].ravel()[where], y * TILES[1] + x)
+    return Busy(times, len(used), pixel[near], on[near], since[near], at[near], where,
+                light[:-1][where // len(used), place], light[1:][where // len(used), place],
+                y * TILES[1] + x)
+
+
+def _near(
+    times: Array, pixels: int, where: Array, pixel: Array, since: Array, at: Array
+) -> Array:
+    """Which events (N,) can have a part in the changes `where`, at any length and delay."""
+    chosen = np.zeros(((len(times) - 1) * pixels,), np.int64)
+    chosen[where] = 1
+    before = np.zeros((len(times), pixels), np.int64)
+    before[1:] = chosen.reshape(-1, pixels).cumsum(0)
+    half = 0.5 * LENGTHS_US[-1]
+    first = np.searchsorted(times, since - half - DELAYS_US[-1]) - 1
+    last = np.searchsorted(times, at + half - DELAYS_US[0])
+    first, last = (np.clip(k, 0, len(times) - 1) for k in (first, last))
+    return np.flatnonzero(before[last, pixel] > before[first, pixel])
 
 
 def _smooth_numbers(times: Array, at: Array, pixel: Array, pixels: int) -> Array:
