@@ -84,6 +84,17 @@ def test_a_single_place_says_nothing() -> None:
     assert frame_exposure([(one, RUN)] * 4) != UNSEEN  # as if of four tiles
 
 
+def test_events_that_are_left_out_have_no_part(monkeypatch: pytest.MonkeyPatch) -> None:
+    place = blurred(12, theta=0.15), RUN
+    monkeypatch.setattr(frame_exposure_module, "MOST", 1500)
+    found, used = frame_exposure([place]), []
+    near = frame_exposure_module._near
+    monkeypatch.setattr(frame_exposure_module, "_near", lambda *a: (
+        used.append(len(near(*a)) / len(a[-1])), np.arange(len(a[-1])))[1])
+    assert frame_exposure([place]) == found != UNSEEN
+    assert used[0] < 0.9
+
+
 def test_every_event_twice_can_be_solved() -> None:
     on = np.array([[1e8, 1e8, 0.0], [1e8, 1e8, 0.0], [0.0, 0.0, 1e8]])
     assert np.isfinite(frame_exposure_module._logs(on[None]))
