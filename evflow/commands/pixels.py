@@ -141,6 +141,11 @@ class Pixels:
             sensor = dataclasses.replace(sensor, cutoff_hz=0.0)
         return Photoreceptor.of(sensor, optics if recorded else Optics())
 
+    def exposure_seen_ms(self, recorded: bool) -> float:
+        """Exposure of frames that the measured camera recorded with its events, as its estimate saw
+        it; 0 where it saw none, and for other frames."""
+        return 1e3 * self._circuit()[1].exposure_s if recorded else 0.0
+
     def _circuit(self) -> tuple[SensorModel, Optics]:
         """The measured camera's circuit; ideal without a camera, or with another sensor."""
         from evflow.camera.optics import Optics, read_sensor

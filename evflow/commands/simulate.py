@@ -89,6 +89,7 @@ class Simulate(Pixels, Footage, Compiling):
         need_absent(self.out, self.overwrite, self.video, self.camera, self.timestamps)
         self._check(io.registry.writer_of(self.out, format))
         source = self.source(self.video)
+        source.notes.extend(self._blur_notes(source))
         if not (self.interpolate and self.max_motion_px):  # the blur is left in
             source.notes[:] = noted(source.notes, 0)
         keep()
@@ -151,6 +152,15 @@ class Simulate(Pixels, Footage, Compiling):
             print(f"note: {self.out} is complete. The film alone: {again}", file=sys.stderr)
             raise
         return f"{described}, {slow:.3g} times slower than life" if slow > 1 else described
+
+    def _blur_notes(self, source: FrameSource) -> list[Note]:
+        """What the measured camera's estimate saw of an exposure that nobody tells here."""
+        seen_ms = self.exposure_seen_ms(source.recorded)
+        if not seen_ms or source.exposure_us or self.exposure_ms is not None:
+            return []
+        return [Note("frames.blur", f"frames may be blurred: those that {self.camera} was measured "
+                     f"from were exposed for {seen_ms:.0f} ms. If these are of the same recording, "
+                     f"--exposure-ms {seen_ms:.0f} takes the blur out")]
 
     def _check(self, writer: type[EventWriter]) -> None:
         """Raise EV013, EV020 before any long work."""

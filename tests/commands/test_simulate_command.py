@@ -302,3 +302,26 @@ def test_a_measured_camera_is_drawn_only_where_it_has_errors(
                     ("--camera", str(plain), "--eta-off", "1")):
         assert main(["simulate", *map(str, given), "-o", str(tmp_path / "no.h5"), *options]) == 2
         assert "EV020" in capsys.readouterr().err
+
+
+def test_an_exposure_that_the_estimate_saw_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It is the recording's, not the camera's: other frames may have another."""
+    none = np.zeros(0, int)
+    frames = drifting(COUNT, SHAPE, 0.5).astype(np.uint8)
+    write_events(tmp_path / "own.h5", Recording(
+        Events(none, none, none, none, SHAPE[::-1]), frames, 40_000 * np.arange(COUNT)))
+    np.save(tmp_path / "other.npy", frames)
+    Camera.constant(SHAPE, 0.2, 0.2).save(
+        tmp_path / "camera.npz", optics_exposure_s=np.asarray(0.0188),
+        optics_exposure_s_std=np.asarray(0.003))
+    camera = "--camera", str(tmp_path / "camera.npz")
+    for source, options, told in (("own.h5", camera, True), ("own.h5", (), False),
+                                  ("own.h5", (*camera, "--exposure-ms", "19"), False),
+                                  ("other.npy", (*camera, "--fps", "25"), False)):
+        _, facts, _ = simulate(capsys, tmp_path / source, tmp_path / "out.h5", "--overwrite",
+                               *options)
+        said = [note["text"] for note in facts["notes"] if note["code"] == "frames.blur"]
+        assert len(said) == told
+        assert all("--exposure-ms 19 takes the blur out" in text for text in said)

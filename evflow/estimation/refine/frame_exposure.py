@@ -166,10 +166,10 @@ def _near(
     times: Array, pixels: int, where: Array, pixel: Array, since: Array, at: Array
 ) -> Array:
     """Which events (N,) can have a part in the changes `where`, at any length and delay."""
-    chosen = np.zeros(((len(times) - 1) * pixels,), np.int64)
+    chosen = np.zeros((len(times) - 1) * pixels, np.int64)
     chosen[where] = 1
     before = np.zeros((len(times), pixels), np.int64)
-    before[1:] = chosen.reshape(-1, pixels).cumsum(0)
+    before[1:] = chosen.reshape(len(times) - 1, pixels).cumsum(0)
     half = 0.5 * LENGTHS_US[-1]
     first = np.searchsorted(times, since - half - DELAYS_US[-1]) - 1
     last = np.searchsorted(times, at + half - DELAYS_US[0])
