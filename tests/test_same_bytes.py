@@ -38,7 +38,8 @@ from evflow.training.step import init_state, make_run_step, optimiser
 STORED = Path(__file__).parent / "data" / "same_bytes.json"
 PACKAGES = ("jax", "jaxlib", "numpy", "opencv-python-headless")
 QUICKLY = ", compiled quickly"
-FLAGS = ("avx2", "fma", "avx512f", "avx512_bf16", "amx_tile")  # what XLA's code depends on
+# What XLA's code depends on; the last two tell processors apart that have the same of the others.
+FLAGS = ("avx2", "fma", "avx512f", "avx512_bf16", "amx_tile", "sse4a", "avx_vnni")
 
 
 def machine() -> str:

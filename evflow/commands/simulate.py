@@ -89,7 +89,6 @@ class Simulate(Pixels, Footage, Compiling):
         need_absent(self.out, self.overwrite, self.video, self.camera, self.timestamps)
         self._check(io.registry.writer_of(self.out, format))
         source = self.source(self.video)
-        source.notes.extend(self._blur_notes(source))
         if not (self.interpolate and self.max_motion_px):  # the blur is left in
             source.notes[:] = noted(source.notes, 0)
         keep()
@@ -106,6 +105,7 @@ class Simulate(Pixels, Footage, Compiling):
             self._frames(source, shown), DEPTH
         ) as made:
             camera, sensor = self.pixels(source.size), self.model()
+            source.notes.extend(self._blur_notes(source))
             with io.open_writer(
                 self.out, source.size, format, overwrite=self.overwrite,
                 exposure_us=source.exposure_us,

@@ -29,7 +29,7 @@ def test_it_is_read_as_it_was_written(
 ) -> None:
     sensor = SensorModel(cutoff_hz=150.0, cutoff_by_light=by_light, refractory_s=2e-3, leak_hz=0.1,
                          shot_hz=2.0, log_map=log_map, eta_is_all=True, noise_resets_memory=True)
-    optics = Optics(20.0, 1e-3, 4.0, 5e-4)
+    optics = Optics(20.0, 1e-3, 4.0, 5e-4, 0.012, 3e-3)
     path = tmp_path / "camera.npz"
     Camera.constant((4, 5)).save(path, **as_arrays(sensor, {"cutoff_hz": 30.0}, optics))
     assert read_sensor(path) == (sensor, optics)
