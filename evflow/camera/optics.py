@@ -36,8 +36,8 @@ class Optics:
 
     offset_dn: light in DN that the pixels see and the frames do not show (dark light minus the
     frames' black level); delay_s: delay in seconds of events after the frame times; exposure_s: of
-    the frames in seconds, as their blur shows, 0 where a file told it or nothing shows it; and the
-    standard deviations of these, NaN where not measured.
+    the frames in seconds, as their blur shows (out of focus they look alike), 0 where a file told
+    it or nothing shows it; and the standard deviations of these, NaN where not measured.
     """
 
     offset_dn: float = 0.0

@@ -159,7 +159,7 @@ class Simulate(Pixels, Footage, Compiling):
         if not seen_ms or source.exposure_us or self.exposure_ms is not None:
             return []
         return [Note("frames.blur", f"frames may be blurred: those that {self.camera} was measured "
-                     f"from were exposed for {seen_ms:.0f} ms. If these are of the same recording, "
+                     f"from looked exposed for {seen_ms:.0f} ms. If these are of that recording, "
                      f"--exposure-ms {seen_ms:.0f} takes the blur out")]
 
     def _check(self, writer: type[EventWriter]) -> None:

@@ -108,9 +108,10 @@ def receptor_notes(
 
 def exposure_notes(exposure: Exposure) -> list[Note]:
     return [Note(
-        "frames.exposure", f"frames are exposed for {1e3 * exposure.seconds:.0f} ± "
-        f"{1e3 * exposure.std_s:.0f} ms, as what moves is blurred in them and not in the events: "
-        "the blur was taken out (--exposure-ms: the right one, or 0 to leave the blur)."
+        "frames.exposure", "what moves is blurred in the frames, and not in the events, as by an "
+        f"exposure of {1e3 * exposure.seconds:.0f} ± {1e3 * exposure.std_s:.0f} ms (frames out of "
+        "focus look alike): the blur was taken out (--exposure-ms: the right one, or 0 to leave "
+        "the blur)."
     )] if exposure.seconds else []
 
 
