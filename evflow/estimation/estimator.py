@@ -21,7 +21,7 @@ from evflow.estimation.front_end import (
 )
 from evflow.estimation.pipeline import check_options
 from evflow.estimation.refine import Stretch, cut
-from evflow.estimation.refine.frame_exposure import UNSEEN, Exposure, with_exposures
+from evflow.estimation.refine.frame_exposure import Exposure, with_exposures
 from evflow.estimation.refine.stretches import most_simulated, spread
 from evflow.estimation.result import CameraEstimate
 from evflow.estimation.state import State, add, thinned
@@ -73,7 +73,8 @@ class CameraEstimator:
         check_options(refine=(refine, ("auto", "off")), pixel=(pixel, ("measured", "ideal")))
         self._params = load_weights() if params is None else params
         pooling_parts(self._params)  # EV018
-        self._refine, self._pixel, self._min_us = refine, pixel, min_window_us
+        self._refine, self._min_us = refine, min_window_us
+        self._is_measured = pixel == "measured"
         self._state: State | None = None
         self._waiting: tuple[Stretch, ...] = ()
         self._busiest: tuple[Stretch, ...] = ()
@@ -182,7 +183,7 @@ class CameraEstimator:
         """The state, or where its front end is not that of the busiest stretches, a new one of the
         stretches that are kept."""
         self._measured = sum(map(_events, self._busiest))
-        exposure = self._exposure(self._busiest)
+        exposure = find_exposure(self._busiest, measured=self._is_measured)
         before = state.front_end.exposure
         exposure = exposure if exposure.seconds else before
         kept = {_place(s): s for s in (*state.read, *self._busiest)}
@@ -198,15 +199,12 @@ class CameraEstimator:
 
     def _begun(self) -> State:
         """The state of the stretches that wait."""
-        exposure = self._exposure(self._waiting)
+        exposure = find_exposure(self._waiting, measured=self._is_measured)
         stretches = with_exposures(self._waiting, exposure)
         return self._read(stretches, self._front_end(stretches, exposure))
 
-    def _exposure(self, stretches: Sequence[Stretch]) -> Exposure:
-        return find_exposure(stretches) if self._pixel == "measured" else UNSEEN
-
     def _front_end(self, stretches: Sequence[Stretch], exposure: Exposure) -> FrontEnd:
-        return find_front_end(stretches, exposure, measured=self._pixel == "measured")
+        return find_front_end(stretches, exposure, measured=self._is_measured)
 
     def _read(self, stretches: tuple[Stretch, ...], front_end: FrontEnd) -> State:
         """The state of some stretches."""

@@ -46,9 +46,12 @@ class FrontEnd:
         return self.lost.law if self.lost else "keeps"
 
 
-def find_exposure(stretches: Sequence[Stretch]) -> Exposure:
+def find_exposure(stretches: Sequence[Stretch], *, measured: bool) -> Exposure:
     """The exposure of the frames, where nobody says it and their blur shows it. Events that wait
-    for a long dead time are as if blurred themselves: there it is not known."""
+    for a long dead time are as if blurred themselves: there it is not known. measured: as of
+    `find_front_end`."""
+    if not measured:
+        return UNSEEN
     found = frame_exposure(receptor_places([(s.recording, s.run) for s in stretches if s.run]))
     if found.seconds and _dead_time(stretches).seconds > WAITING_S:
         return UNSEEN

@@ -28,7 +28,7 @@ from evflow.estimation.front_end import find_exposure, find_front_end
 from evflow.estimation.halves import FirstPart, divided
 from evflow.estimation.reading import BATCH, BUDGETS, EFFORTS, Effort, Order, gain, ordered
 from evflow.estimation.refine import Stretch, cut, pixel_posterior
-from evflow.estimation.refine.frame_exposure import UNSEEN, with_exposures
+from evflow.estimation.refine.frame_exposure import with_exposures
 from evflow.estimation.result import CameraEstimate
 from evflow.estimation.state import State, add, read_stretch, summary_so_far
 from evflow.estimation.static import estimate_noise
@@ -132,7 +132,7 @@ def measure(
     release(recording)
     stage("looking for the photoreceptor")
     measured = pixel == "measured"
-    exposure = find_exposure(_used(stretches, order)) if measured else UNSEEN
+    exposure = find_exposure(_used(stretches, order), measured=measured)
     stretches = with_exposures(stretches, exposure)
     used = _used(stretches, order)
     state = State(params, find_front_end(used, exposure, measured=measured))
@@ -175,7 +175,7 @@ def read_whole(recording: Recording, params: api.Params) -> State:
     plan = plan_windows(recording)
     iter_windows(recording, plan=plan)
     stretches = cut(recording, plan)
-    exposure = find_exposure(stretches)
+    exposure = find_exposure(stretches, measured=True)
     stretches = with_exposures(stretches, exposure)
     state = State(params, find_front_end(stretches, exposure, measured=True))
     simulated = ordered(stretches, "full").simulated

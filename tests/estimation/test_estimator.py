@@ -185,7 +185,7 @@ def test_an_exposure_that_is_seen_later_is_that_of_all_that_is_kept(
     recording, _ = hidden(3)
     seen = iter([UNSEEN, Exposure(0.012, 0.002), Exposure(0.015, 0.002), UNSEEN])
     exposures: list[set[int]] = []
-    monkeypatch.setattr(estimator_module, "find_exposure", lambda _: next(seen))
+    monkeypatch.setattr(estimator_module, "find_exposure", lambda _, measured: next(seen))
     monkeypatch.setattr(estimator_module, "find_front_end", lambda on, exposure, **_: (
         exposures.append({s.recording.exposure_us for s in on}), FrontEnd(exposure=exposure))[1])
     monkeypatch.setattr(estimator_module, "agree", lambda *_: False)
