@@ -70,8 +70,9 @@ def find_front_end(
         return FrontEnd(dead=dead, faulty=faulty, exposure=exposure)
     noise_dn = frame_noise([(recording, i) for recording, run in runs for i in run])
     films: Films = {}
-    found, lost = (find_photoreceptor(runs, noise_dn, films, shortest_s=dead.shortest_s,
-                                      sharp=dead.measured) if measured else (None, None))
+    found, lost = (find_photoreceptor(
+        runs, noise_dn, films, shortest_s=dead.shortest_s, edge_s=dead.edge_s,
+        measured=dead.measured) if measured else (None, None))
     blur_s = 1e-6 * float(np.mean([recording.exposure_us for recording, _ in runs]))
     seen_by = found.used if found else IDEAL
     return FrontEnd(seen_by, noise_dn, blur_s, found, settled(dead, lost), lost, faulty, films,

@@ -87,7 +87,8 @@ def _on_its_own(first: FirstPart) -> State:
     found, lost = front_end.found, front_end.lost
     if found is not None and receptor_places(runs) != receptor_places(searched):
         found, lost = find_photoreceptor(
-            runs, front_end.noise_dn, shortest_s=dead.shortest_s, sharp=dead.measured)
+            runs, front_end.noise_dn, shortest_s=dead.shortest_s, edge_s=dead.edge_s,
+            measured=dead.measured)
     seen_by = found.used if found is not None else IDEAL
     own = dataclasses.replace(front_end, seen_by=seen_by, found=found,
                               dead=settled(dead, lost), lost=lost, films={})

@@ -38,6 +38,7 @@ def test_it_is_found_whether_events_wait_or_are_lost(dead_us: int, lost: bool) -
     found = dead_time(stream(intervals))
     assert found.measured
     assert abs(found.seconds * 1e6 - dead_us) < 0.05 * dead_us
+    assert found.edge_s == found.seconds
     assert found.std_s < 0.1 * found.seconds
 
 
@@ -59,6 +60,7 @@ def test_without_an_edge_nothing_is_said(intervals: np.ndarray) -> None:
     found = dead_time(stream(whole))
     assert not found.measured
     assert np.isnan(found.std_s)
+    assert found.edge_s == 0.0
 
 
 def test_a_hot_pixel_that_fires_like_a_clock_is_no_dead_time() -> None:
@@ -71,7 +73,8 @@ def test_a_hot_pixel_that_fires_like_a_clock_is_no_dead_time() -> None:
 @pytest.mark.parametrize("wide", [1.05, 1.2])
 @pytest.mark.parametrize("share", [0.1, 0.2, 1.0])
 def test_the_edge_of_a_lamp_s_light_is_no_dead_time(share: float, wide: float) -> None:
-    """Intervals of 450 us and a little more, in a part of the view; a dead time is everywhere."""
+    """Intervals of 450 us and a little more, in a part of the view; a dead time is everywhere.
+    Yet a dead time may show in a part alone, so the edge is told."""
     rng, intervals = np.random.default_rng(6), wanted(4000.0)
     intervals = np.maximum(intervals, 600.0)
     lit = np.arange(PIXELS) < share * PIXELS
@@ -79,6 +82,7 @@ def test_the_edge_of_a_lamp_s_light_is_no_dead_time(share: float, wide: float) -
     often = rng.random((PIXELS, EACH)) < 0.7
     found = dead_time(stream(np.where(lit[:, None] & often, edge, intervals)))
     assert found.measured == (share == 1.0)
+    assert found.edge_s == pytest.approx(450e-6, rel=0.02)
 
 
 def test_intervals_are_a_pixel_s_own() -> None:

@@ -18,6 +18,7 @@ from evflow.estimation.refine.still_noise import quiet_maps
 from evflow.estimation.refine.stretches import BAND, LARGE, PART, plan_chunks, plan_runs
 from evflow.estimation.refine.trace import Trace, trace_of_events
 from evflow.files.spool import put_aside
+from evflow.light.log_maps import LINLOG_KNEE
 from evflow.process.memory import give_back
 from evflow.recordings.glitches import SATURATED_DN
 from evflow.recordings.region import bands, inside
@@ -26,7 +27,7 @@ from evflow.types import Events, Recording
 
 Box = tuple[slice, slice]
 WHOLE: Box = (slice(None), slice(None))
-DARK_DN = 15.0  # below it, half a DN of noise is .03 log units
+DARK_DN = LINLOG_KNEE  # below, where the map is linear, half a DN of noise is .075 log units
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ changes within the dead times are taken out as the right kind loses them, the po
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import jax
@@ -41,6 +41,9 @@ OPAQUE = 0.3  # unexplained share from which the path is too wrong for that
 # Intervals are longer than this where a pixel hardly has two events. They say nothing of a dead
 # time, but some loss may well seem to explain so few:
 TOO_LONG_S = 1e-2
+# Relative error of the dead time: of 32 cameras that are held in reset for 1 to 4 ms 69 % lie
+# within it, and 97 % within twice as much.
+DEAD_ERROR = {"resets": 0.21, "drops": 0.02, "keeps": 0.02}
 NEGLIGIBLE = 0.02  # log units of a threshold, less than what is known of it
 LEAST = 1e-3  # log units, of a threshold
 WAITED, HARDLY = 1.05, 1e-4  # of the dead time; of a weight
@@ -105,7 +108,7 @@ def kept_contrast(data: Sample, found: Found, dead_s: float) -> Lost | None:
         excess = np.maximum(excess * more**0.7, 1.0)
     if np.abs(np.log(excess)).max() < NEGLIGIBLE:
         return None
-    return Lost("keeps", dead_s, 0.02 * dead_s, excess, found.theta)
+    return Lost("keeps", dead_s, DEAD_ERROR["keeps"] * dead_s, excess, found.theta)
 
 
 def _counted(paths: list[tuple[Array, float]], theta: Array, model: SensorModel) -> Array:
@@ -134,7 +137,7 @@ def without_waiting(data: Sample, dead_s: float) -> Sample:
 
 
 def lost_contrast(
-    data: Sample, found: Found, shortest_s: float, *, sharp: bool
+    data: Sample, found: Found, shortest_s: float, edge_s: float = 0.0
 ) -> tuple[Found, Lost | None]:
     """Whether and how pixels lose contrast in their dead time.
 
@@ -142,7 +145,8 @@ def lost_contrast(
         data: the sample in which the photoreceptor was searched for.
         found: that search, for pixels that keep their contrast.
         shortest_s: a pixel's shortest usual intervals, in seconds.
-        sharp: whether there are hardly any shorter ones, as where they are the dead time itself.
+        edge_s: where they abruptly become many, as where it is the dead time of pixels that drop
+            events; else 0.
 
     Returns:
         The search for pixels as they are, with thresholds as if contrast were kept, and how it is
@@ -152,13 +156,13 @@ def lost_contrast(
         return found, None
     size = 0.5 * min(found.size, BELIEVED)
     tried = [way for seen_by in dict.fromkeys((found.ideal, found.used))
-             for way in _ways(data, seen_by, shortest_s, sharp=sharp)]
-    best = max(tried, key=lambda way: way.gain)
-    if size * best.gain < CLEARLY:
+             for way in _ways(data, seen_by, shortest_s, edge_s)]
+    if size * _best(tried).gain < CLEARLY:
         return found, None
-    if best.law == "resets":
-        finer = best.dead_s + FINE * shortest_s
-        best = max(_resets(data, best.seen_by, finer[finer > 0]), key=lambda way: way.gain)
+    drops, resets = ([way for way in tried if way.law == law] for law in ("drops", "resets"))
+    near = _best(resets)
+    finer = near.dead_s + FINE * shortest_s
+    best = _best([*drops, *_resets(data, near.seen_by, finer[finer > 0])])
     again = find(best.data)
     if again is None:
         return found, None
@@ -172,10 +176,9 @@ def lost_contrast(
     excess = taken_as_kept / theta
     if np.abs(np.log(excess)).max() < NEGLIGIBLE:
         return found, None
-    error = float(FINE[1] - FINE[0]) if best.law == "resets" else 0.02
     return (dataclasses.replace(again, theta=again.theta * excess,
                                 ideal_theta=again.ideal_theta * excess),
-            Lost(best.law, best.dead_s, error * shortest_s, excess, theta))
+            Lost(best.law, best.dead_s, DEAD_ERROR[best.law] * best.dead_s, excess, theta))
 
 
 class Way(NamedTuple):
@@ -187,6 +190,10 @@ class Way(NamedTuple):
     dead_s: float
     seen_by: Photoreceptor
     data: Sample
+
+
+def _best(ways: Sequence[Way]) -> Way:
+    return max(ways, key=lambda way: way.gain)
 
 
 def _too_fast(data: Sample, found: Found, seconds: float) -> float:
@@ -204,10 +211,10 @@ def _too_fast(data: Sample, found: Found, seconds: float) -> float:
 
 
 def _ways(
-    data: Sample, seen_by: Photoreceptor, shortest_s: float, *, sharp: bool
+    data: Sample, seen_by: Photoreceptor, shortest_s: float, edge_s: float
 ) -> Iterator[Way]:
-    if sharp:
-        yield _drops(data, seen_by, shortest_s)
+    if edge_s:
+        yield _drops(data, seen_by, edge_s)
     yield from _resets(data, seen_by, np.array(COARSE) * shortest_s)
 
 

@@ -68,26 +68,27 @@ def receptor_sample(
 
 def find_photoreceptor(
     places: Sequence[Place], noise_dn: float = 0.0, films: Films | None = None, *,
-    shortest_s: float = 0.0, sharp: bool = False,
+    shortest_s: float = 0.0, edge_s: float = 0.0, measured: bool = False,
 ) -> tuple[Found | None, Lost | None]:
     """The photoreceptor of a camera and the offset and delay of its frames, and the contrast that
     its pixels lose in their dead time.
 
     Args:
         places, noise_dn, films: as of `receptor_sample`.
-        shortest_s, sharp: as of `lost_contrast`; 0 where no shortest intervals are known.
+        shortest_s, edge_s: as of `lost_contrast`; 0 where no shortest intervals are known.
+        measured: whether the shortest intervals are the dead time.
 
     Returns:
         The photoreceptor, None with too few events; and what is lost, None if it is kept and is
         sent almost completely.
     """
     data = receptor_sample(places, noise_dn, films)
-    if data is not None and sharp:
+    if data is not None and measured:
         data = without_waiting(data, shortest_s)
     found = find(data) if data is not None else None
     if data is None or found is None or not shortest_s:
         return found, None
-    found, lost = lost_contrast(data, found, shortest_s, sharp=sharp)
-    if lost is None and sharp:
+    found, lost = lost_contrast(data, found, shortest_s, edge_s)
+    if lost is None and measured:
         lost = kept_contrast(data, found, shortest_s)
     return found, lost

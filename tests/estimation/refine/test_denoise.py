@@ -50,4 +50,11 @@ def test_much_noise_is_taken_away_and_little_is_left() -> None:
     before, after = (float(np.std(f - clean)) for f in (noisy, denoised(noisy, 4.0)))
     assert after < 0.9 * before
     assert np.std(denoised(clean, 4.0) - clean) < 1.0
-    assert denoised(noisy, 1.0) is noisy
+    assert denoised(noisy, 0.7) is noisy
+
+
+def test_a_little_noise_is_taken_away_where_it_matters_in_dark_scenes() -> None:
+    """At 20 DN, 1 DN of noise is .05 log units."""
+    clean, noisy = (scene(dn).frame_dn(0) / 5 for dn in (0.0, 5.0))
+    before, after = (float(np.std(f - clean)) for f in (noisy, denoised(noisy, 1.0)))
+    assert after < 0.8 * before

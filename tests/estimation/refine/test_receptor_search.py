@@ -274,8 +274,8 @@ def test_contrast_lost_in_dead_times_is_told_from_contrast_kept(law: str) -> Non
     dn, dt_s = film(), FRAME_S / STEPS
     seen = integrated(dn, dt_s, 0.0, 0.0, SUB)
     data = sample_of(dn, dead_events(seen, dt_s / SUB, law))
-    shortest_s, sharp = (1.3 * DEAD_S, False) if law == "resets" else (DEAD_S, True)
-    found, lost = lost_contrast(data, find(data), shortest_s, sharp=sharp)
+    shortest_s, edge_s = (1.3 * DEAD_S, 0.0) if law == "resets" else (DEAD_S, DEAD_S)
+    found, lost = lost_contrast(data, find(data), shortest_s, edge_s)
     assert (lost.law if lost else "keeps") == law
     theta = found.theta / (lost.excess if lost else 1.0)
     np.testing.assert_allclose(theta, [0.25, 0.2], rtol=0.08)
@@ -312,9 +312,9 @@ def test_intervals_that_are_missing_tell_a_loss_from_an_offset(
     assert lost_module._too_fast(ideal, find(ideal), 0.7 * shortest_s) < 0.2 * share
     monkeypatch.setattr(lost_module, "find", lambda one: dataclasses.replace(
         find(one), explained=(kept.explained[int(kept.needed)],) * 2))  # as by an offset
-    found = [lost_contrast(data, kept, 1.3 * DEAD_S, sharp=False)[1]]
+    found = [lost_contrast(data, kept, 1.3 * DEAD_S)[1]]
     monkeypatch.setattr(lost_module, "_too_fast", lambda *_: 0.0)
-    found.append(lost_contrast(data, kept, 1.3 * DEAD_S, sharp=False)[1])
+    found.append(lost_contrast(data, kept, 1.3 * DEAD_S)[1])
     assert found[0] is not None
     assert found[0].law == "resets"
     assert found[1] is None
@@ -325,8 +325,8 @@ def test_long_intervals_tell_of_no_dead_time() -> None:
     dn, dt_s = film(), FRAME_S / STEPS
     data = sample_of(dn, dead_events(integrated(dn, dt_s, 0.0, 0.0, SUB), dt_s / SUB, "resets"))
     kept = find(data)
-    assert lost_contrast(data, kept, 1.01 * lost_module.TOO_LONG_S, sharp=False) == (kept, None)
-    assert lost_contrast(data, kept, 0.8 * lost_module.TOO_LONG_S, sharp=False)[1] is not None
+    assert lost_contrast(data, kept, 1.01 * lost_module.TOO_LONG_S) == (kept, None)
+    assert lost_contrast(data, kept, 0.8 * lost_module.TOO_LONG_S)[1] is not None
 
 
 def intervals_of(data: Sample) -> np.ndarray:
@@ -339,12 +339,12 @@ def intervals_of(data: Sample) -> np.ndarray:
 def test_thresholds_that_are_none_say_nothing_of_a_loss(monkeypatch: pytest.MonkeyPatch) -> None:
     dn, dt_s = film(), FRAME_S / STEPS
     data = sample_of(dn, dead_events(integrated(dn, dt_s, 0.0, 0.0, SUB), dt_s / SUB, "drops"))
-    assert lost_contrast(data, find(data), DEAD_S, sharp=True)[1] is not None
+    assert lost_contrast(data, find(data), DEAD_S, DEAD_S)[1] is not None
     solved = lost_module._solved
     monkeypatch.setattr(lost_module, "_solved", lambda *a: (
         solved(*a)[0] * np.array([1.0, -1.0]), solved(*a)[1]))
     kept = find(data)
-    assert lost_contrast(data, kept, DEAD_S, sharp=True) == (kept, None)
+    assert lost_contrast(data, kept, DEAD_S, DEAD_S) == (kept, None)
 
 
 def test_too_few_events_and_no_thresholds_say_nothing_of_what_is_never_sent() -> None:
