@@ -12,6 +12,7 @@ Array = np.ndarray
 
 QUIET = 0.05  # log units: below the thresholds of usable cameras
 MANY, LEAST_THETA = 20, 0.03  # events; log units, less than any usable threshold
+LEAST_MOVED = 0.02  # log units of the path's change per event: less is a light that blinks unseen
 LEAST_RISE = 0.03  # log units in two frame intervals: smaller changes cause no event
 TILES = (6, 8)  # of the image; their median is robust where the path misses motion
 ENOUGH_S = 2.0  # pixel seconds of a tile
@@ -69,9 +70,11 @@ def hot_ones(s: Sightings, dt_s: Array) -> Array:
         quiet_maps(span, events, dt_s, shown), events.sum(0), float(dt_s.sum()))
     group, on, off = counts_so_far(s)
     number = np.bincount(group)
+    moved = np.bincount(group[1:], np.abs(np.diff(s.path)) * (np.diff(group) == 0), len(number))
     net, path = (np.bincount(group, v * v) - np.bincount(group, v) ** 2 / number
                  for v in (on + off, s.path.astype(np.float64)))
-    hot.ravel()[s.pixel[s.first]] |= unlike_the_path(net, path, number)
+    hot.ravel()[s.pixel[s.first]] |= unlike_the_path(net, path, number) | (
+        (number >= MANY) & (moved < LEAST_MOVED * number))
     return hot
 
 
