@@ -20,9 +20,9 @@ from evflow.estimation.halves import FirstPart
 from evflow.estimation.pipeline import estimate_camera
 from evflow.estimation.refine import frame_noise, receptor_sample
 from evflow.estimation.refine.frame_exposure import TELLING, with_exposure
-from evflow.estimation.refine.lost_contrast import without_waiting
 from evflow.estimation.refine.receptor_search import explained
 from evflow.estimation.refine.stretches import INTERVALS
+from evflow.estimation.refine.waiting import without_waiting
 from evflow.estimation.result import CameraEstimate
 from evflow.metrics.streams import compare, correlations
 from evflow.notes import Note

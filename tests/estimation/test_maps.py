@@ -72,7 +72,7 @@ def test_all_but_the_thresholds_are_left() -> None:
 
 def lost_by_reset(on: float) -> Lost:
     """SUMMARY's thresholds, too high by 1.25 (ON) and right (OFF); a regression that says `on`."""
-    return Lost("resets", 2e-3, 1e-4, np.array([1.25, 1.0]), np.array([on, 0.25]))
+    return Lost("resets", 2e-3, np.array([1.25, 1.0]), np.array([on, 0.25]))
 
 
 def test_thresholds_of_pixels_that_lose_contrast_are_lowered_and_their_errors_grow() -> None:

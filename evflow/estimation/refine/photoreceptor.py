@@ -8,12 +8,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from evflow.estimation.refine.lost_contrast import (
-    Lost,
-    kept_contrast,
-    lost_contrast,
-    without_waiting,
-)
+from evflow.estimation.refine.lost_contrast import Lost, lost_contrast
 from evflow.estimation.refine.path import STEPS, Films, Place, as_seen, interpolated, of_place
 from evflow.estimation.refine.readouts import without_readouts
 from evflow.estimation.refine.receptor_data import Part, Sample, sample
@@ -22,6 +17,7 @@ from evflow.estimation.refine.receptor_search import find
 from evflow.estimation.refine.sightings import sight
 from evflow.estimation.refine.still_noise import hot_ones
 from evflow.estimation.refine.stretches import LARGE, most_simulated, spread
+from evflow.estimation.refine.waiting import kept_contrast, without_waiting
 from evflow.process.memory import give_back
 from evflow.recordings.bunches import bunch
 from evflow.simulator.photoreceptor import IDEAL
