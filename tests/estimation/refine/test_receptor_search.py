@@ -3,69 +3,31 @@ found again in events that an independent pixel makes of a known film."""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 from helpers.films import (
-    DEAD_S,
     FRAME_S,
     INTERVALS,
     SHAPE,
-    SUB,
-    dead_events,
     film,
     integrated,
     lin_log,
     log_eps,
-    view,
 )
+from helpers.samples import NONE_HOT, looked_at, no_readouts
 
-from evflow.estimation.refine import lost_contrast as lost_module
 from evflow.estimation.refine import receptor_search
-from evflow.estimation.refine.held_in_reset import held_in_reset
-from evflow.estimation.refine.lost_contrast import lost_contrast
 from evflow.estimation.refine.path import STEPS
 from evflow.estimation.refine.receptor_data import Sample, sample
 from evflow.estimation.refine.receptor_prior import FEW, FEWER, small_sample_odds
 from evflow.estimation.refine.receptor_profile import Other
 from evflow.estimation.refine.receptor_regression import Regression
 from evflow.estimation.refine.receptor_search import find
-from evflow.estimation.refine.sightings import Sightings, sight
-from evflow.estimation.refine.waiting import kept_contrast, without_waiting
+from evflow.estimation.refine.sightings import sight
 from evflow.simulator.photoreceptor import FAST, IDEAL, Photoreceptor, seen_path
 from evflow.types import Events
-
-
-def events_of(
-    path: np.ndarray, dt_s: float, delay_s: float, on: float, off: float, noise_hz: float = 0.0
-) -> Events:
-    """Events of pixels that see path (T, H, W), instants dt_s apart: one instant and event at a
-    time. Noise of either polarity stores what is seen, as every event does."""
-    rng = np.random.default_rng(1)
-    a, b = (rng.normal(theta, 0.03 * theta, path.shape[1:]) for theta in (on, off))
-    memory = path[0] + rng.uniform(-a, b)
-    rows = []
-
-    def happen(where: np.ndarray, at: np.ndarray, up: np.ndarray) -> None:
-        y, x = np.nonzero(where)
-        rows.append(np.stack([x, y, np.round((at * dt_s + delay_s) * 1e6)[where], up[where]]))
-
-    for i in range(1, len(path)):
-        before, now = path[i - 1], path[i]
-        if noise_hz:
-            struck = rng.random(now.shape) < 2 * noise_hz * dt_s
-            memory = np.where(struck, now, memory)
-            happen(struck, np.full(now.shape, i), rng.random(now.shape) < 0.5)
-        while (crossed := (now - memory > a) | (memory - now > b)).any():
-            up = now > memory
-            memory = memory + np.where(up, a, -b) * crossed
-            part = (memory - before) / np.where(crossed, now - before, 1.0)
-            happen(crossed, i - 1 + part, up)
-    x, y, t, p = np.concatenate(rows, 1).astype(np.int64)
-    order = np.argsort(t, kind="stable")
-    return Events(x[order], y[order], t[order] + 10_000, p[order] > 0, SHAPE[::-1])
 
 
 @pytest.mark.parametrize(("offset", "tau_s", "by_light"), [
@@ -79,36 +41,6 @@ def test_the_path_is_that_of_a_plain_integration(
     got = seen_path(dn, np.full(39, dt_s, np.float32), np.float32(offset),
                     np.float32(max(tau_s, FAST)), by_light)
     assert np.abs(np.asarray(got) - want).max() < (5e-3 if tau_s else 0.02)
-
-
-NONE_HOT = np.zeros(SHAPE[0] * SHAPE[1], bool)
-
-
-def no_readouts(s: Sightings) -> np.ndarray:
-    """How many events of their pixel that come with a readout precede those sighted: none."""
-    return np.zeros(len(s.pixel), int)
-
-
-def looked_at(
-    offset: float, cutoff_hz: float, delay_s: float = 0.0, by_light: bool = True,
-    noise_hz: float = 0.0, gain: float = 1.0, log: Callable[[np.ndarray], np.ndarray] = lin_log,
-) -> Sample:
-    """What such pixels, of .25 and .2, show of the film, whose light is multiplied by gain."""
-    dn, dt_s = gain * film(), FRAME_S / STEPS
-    tau_s = 1 / (2 * np.pi * cutoff_hz) if cutoff_hz else 0.0
-    seen = integrated(dn, dt_s, offset, tau_s, SUB, by_light, log)
-    events = events_of(seen, dt_s / SUB, delay_s, 0.25, 0.2, noise_hz)
-    return sample_of(dn, events)
-
-
-def sample_of(dn: np.ndarray, events: Events) -> Sample:
-    """The sample of events beside a film."""
-    times = 10_000 + np.round(np.arange(INTERVALS + 1) * FRAME_S * 1e6).astype(np.int64)
-    s = sight(events, times, lin_log(dn).astype(np.float32), STEPS)
-    steps_s = np.full(INTERVALS * STEPS, FRAME_S / STEPS)
-    data = sample([(dn.astype(np.float32), steps_s, s, no_readouts(s), np.zeros(dn[0].size, bool))])
-    assert data is not None
-    return data
 
 
 def test_slopes_are_those_of_differences() -> None:
@@ -268,141 +200,3 @@ def test_the_less_probable_law_widens_what_is_left_open() -> None:
         3e-3, np.array([0.2, 0.3]), np.diag([4.0, 1e-8, 1e-8]), np.array([0.1, 0.0]))
     assert covariance == pytest.approx(np.diag([4.0, 1e-8 + 0.25 * 4e-6, 1e-8]))
     assert theta_error == pytest.approx([0.1, 0.5 * np.log(2)])
-
-
-@pytest.mark.parametrize("law", ["keeps", "drops", "resets"])
-def test_contrast_lost_in_dead_times_is_told_from_contrast_kept(law: str) -> None:
-    """Taken as kept, these thresholds would come out up to twice too high."""
-    dn, dt_s = film(), FRAME_S / STEPS
-    seen = integrated(dn, dt_s, 0.0, 0.0, SUB)
-    data = sample_of(dn, dead_events(seen, dt_s / SUB, law))
-    shortest_s, edge_s = (1.3 * DEAD_S, 0.0) if law == "resets" else (DEAD_S, DEAD_S)
-    found, lost = lost_contrast(data, find(data), shortest_s, edge_s)
-    assert (lost.law if lost else "keeps") == law
-    theta = found.theta / (lost.excess if lost else 1.0)
-    np.testing.assert_allclose(theta, [0.25, 0.2], rtol=0.08)
-    if lost:
-        assert lost.dead_s == pytest.approx(DEAD_S, rel=0.12)
-        assert min(lost.excess) > 1.1
-
-
-@pytest.mark.parametrize("law", ["ideal", "keeps", "drops", "resets"])
-def test_changes_from_event_to_event_tell_of_a_reset(law: str) -> None:
-    dn, dt_s = film(), FRAME_S / STEPS
-    seen = integrated(dn, dt_s, 0.0, 0.0, SUB)
-    data = sample_of(dn, events_of(seen, dt_s / SUB, 0.0, 0.25, 0.2) if law == "ideal"
-                     else dead_events(seen, dt_s / SUB, law))
-    if law == "keeps":
-        data = without_waiting(data, DEAD_S)
-    found = held_in_reset(data, [IDEAL], 1.3 * DEAD_S)
-    sure = found is not None and 200 * found.gain > lost_module.SURELY
-    assert sure == (law == "resets")
-    if found and sure:
-        assert found.dead_s == pytest.approx(DEAD_S, rel=0.1)
-        np.testing.assert_allclose(found.theta, [0.25, 0.2], rtol=0.08)
-        assert (found.kept > 1.1 * found.theta).all()
-
-
-def test_a_reset_that_sums_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The path's errors may add up in them: of 60 cameras 4 more were recognised, and the worst
-    threshold was off by 29 instead of 44 %."""
-    dn, dt_s = film(), FRAME_S / STEPS
-    data = sample_of(dn, dead_events(integrated(dn, dt_s, 0.0, 0.0, SUB), dt_s / SUB, "resets"))
-    kept = find(data)
-    monkeypatch.setattr(lost_module, "_reset_by_sums", lambda found, *_: (found, None))
-    found, lost = lost_contrast(data, kept, 1.3 * DEAD_S)
-    assert lost is not None
-    assert lost.law == "resets"
-    theta = (found.theta if found.needed else found.ideal_theta) / lost.excess
-    np.testing.assert_allclose(theta, [0.25, 0.2], rtol=0.1)
-    np.testing.assert_allclose(lost.theta, [0.25, 0.2], rtol=0.1)
-
-
-def test_events_that_waited_for_their_dead_time_do_not_count_as_crossings() -> None:
-    """Their light has gone on: it looks like a slow photoreceptor, and like frames with a delay."""
-    dn, dt_s = view(), FRAME_S / STEPS
-    data = sample_of(dn, dead_events(integrated(dn, dt_s, 0.0, 0.0, SUB), dt_s / SUB, "keeps"))
-    before, after = find(data), find(without_waiting(data, DEAD_S))
-    assert before.seen.cutoff_hz > 0
-    assert before.seen.delay_s < -2e-3
-    assert after.used.cutoff_hz == 0
-    assert abs(after.used.delay_s) < 5e-4
-    assert after.explained[0] > max(before.explained) + 0.02
-    np.testing.assert_allclose(after.theta, [0.25, 0.2], rtol=0.05)
-
-
-def test_intervals_that_are_missing_tell_a_loss_from_an_offset(
-    monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """An offset may explain as much; but then there are intervals as short as the path makes."""
-    dn, dt_s = film(), FRAME_S / STEPS
-    seen = integrated(dn, dt_s, 0.0, 0.0, SUB)
-    data = sample_of(dn, dead_events(seen, dt_s / SUB, "resets"))
-    kept = find(data)
-    share = lost_module._too_fast(data, kept, 0.7 * 1.3 * DEAD_S)
-    assert share > 4 * lost_module.MISSING > 0
-    ideal = sample_of(dn, events_of(seen, dt_s / SUB, 0.0, 0.25, 0.2))
-    shortest_s = np.quantile(intervals_of(ideal), 0.01) * dt_s
-    assert lost_module._too_fast(ideal, find(ideal), 0.7 * shortest_s) < 0.2 * share
-    monkeypatch.setattr(lost_module, "held_in_reset", lambda *_: None)
-    monkeypatch.setattr(lost_module, "find", lambda one: dataclasses.replace(
-        find(one), explained=(kept.explained[int(kept.needed)],) * 2))  # as by an offset
-    found = [lost_contrast(data, kept, 1.3 * DEAD_S)[1]]
-    monkeypatch.setattr(lost_module, "_too_fast", lambda *_: 0.0)
-    found.append(lost_contrast(data, kept, 1.3 * DEAD_S)[1])
-    assert found[0] is not None
-    assert found[0].law == "resets"
-    assert found[1] is None
-
-
-def test_long_intervals_tell_of_no_dead_time() -> None:
-    """A loss in 10 ms seemed to explain an ideal camera with few events: theta_off was 62 % low."""
-    dn, dt_s = film(), FRAME_S / STEPS
-    data = sample_of(dn, dead_events(integrated(dn, dt_s, 0.0, 0.0, SUB), dt_s / SUB, "resets"))
-    kept = find(data)
-    assert lost_contrast(data, kept, 1.01 * lost_module.TOO_LONG_S) == (kept, None)
-    assert lost_contrast(data, kept, 0.8 * lost_module.TOO_LONG_S)[1] is not None
-
-
-def intervals_of(data: Sample) -> np.ndarray:
-    """Between successive events of a pixel, in fine steps."""
-    used = np.asarray(data.weight[0]) > 0
-    pixel, at = np.asarray(data.pixel[0])[used], np.asarray(data.at[0])[used]
-    return np.diff(at)[np.diff(pixel) == 0]
-
-
-def test_thresholds_that_are_none_say_nothing_of_a_loss(monkeypatch: pytest.MonkeyPatch) -> None:
-    dn, dt_s = film(), FRAME_S / STEPS
-    data = sample_of(dn, dead_events(integrated(dn, dt_s, 0.0, 0.0, SUB), dt_s / SUB, "drops"))
-    assert lost_contrast(data, find(data), DEAD_S, DEAD_S)[1] is not None
-    solved = lost_module._solved
-    monkeypatch.setattr(lost_module, "_solved", lambda *a: (
-        solved(*a)[0] * np.array([1.0, -1.0]), solved(*a)[1]))
-    kept = find(data)
-    assert lost_contrast(data, kept, DEAD_S, DEAD_S) == (kept, None)
-
-
-def test_too_few_events_and_no_thresholds_say_nothing_of_what_is_never_sent() -> None:
-    dn, dt_s = view(), FRAME_S / STEPS
-    data = sample_of(dn, dead_events(integrated(dn, dt_s, 0.0, 0.0, SUB), dt_s / SUB, "keeps"))
-    found = find(without_waiting(data, DEAD_S))
-    for theta in ([np.nan, 0.2], [0.2, np.nan], [-0.1, 0.2], [0.25, 50.0]):
-        other = dataclasses.replace(found, theta=np.array(theta))
-        assert kept_contrast(data, other, DEAD_S) is None
-
-
-@pytest.mark.parametrize(("dead_s", "some"), [(DEAD_S, True), (1e-4, False)])
-def test_contrast_that_is_kept_and_never_sent_is_known_from_the_path(
-    dead_s: float, some: bool
-) -> None:
-    dn, dt_s = view(), FRAME_S / STEPS
-    data = sample_of(dn, dead_events(integrated(dn, dt_s, 0.0, 0.0, SUB), dt_s / SUB, "keeps"))
-    found = find(without_waiting(data, DEAD_S))
-    lost = kept_contrast(data, found, dead_s)
-    assert (lost is not None) == some
-    if lost:
-        assert lost.law == "keeps"
-        assert ((lost.excess > 1.05) & (lost.excess < 1.5)).all()
-        value, error = lost.corrected(0, 0.3, 0.01)
-        assert value == pytest.approx(0.3 / lost.excess[0])
-        assert error > 0.01 / lost.excess[0]
