@@ -22,6 +22,8 @@ Array = np.ndarray
 PARTS = np.linspace(0.0, 1.0, 11)
 FREEDOM = 3.0  # of Student's t: noise, and what the path misses, are far off
 STEPS = 20  # of its fit
+ENOUGH = 100  # changes of each direction
+LEAST = 1e-6  # log units, of the fit's scale
 CLEAR = 1e-3  # weight below which an event has waited for the dead time, or is beside black frames
 
 
@@ -46,9 +48,12 @@ def held_in_reset(data: Sample, ways: list[Photoreceptor], shortest_s: float) ->
 
     Returns:
         The dead time that makes the events most likely, and how much more than if contrast is kept,
-        each with the better photoreceptor; None if that is at an end of its range.
+        each with the better photoreceptor; None if that is at an end of its range, or with too few
+        events that follow one another without noise between them.
     """
     fits = [_fits(data, seen_by, shortest_s * PARTS) for seen_by in ways]
+    if not all(fits):
+        return None
     best = int(np.argmin([min(fit.loss for fit in row) for row in fits]))
     row = fits[best]
     loss = np.array([fit.loss for fit in row])
@@ -67,10 +72,13 @@ class _Fit(NamedTuple):
 
 
 def _fits(data: Sample, seen_by: Photoreceptor, dead_s: Array) -> list[_Fit]:
-    """Thresholds for each dead time, and the mean negative log likelihood of the changes."""
+    """Thresholds for each dead time, and the mean negative log likelihood of the changes; nothing
+    with too few of them."""
     data = split_at_noise(data, seen_by)
     rows = [_changes(one_stretch(data, c), seen_by, dead_s) for c in range(len(data.dn))]
     rose = np.concatenate([on for _, on in rows])
+    if min(rose.sum(), (~rose).sum()) < ENOUGH:
+        return []
     return [_fit(change, rose) for change in np.concatenate([row for row, _ in rows], 1)]
 
 
@@ -100,12 +108,12 @@ def _changes(d: Sample, seen_by: Photoreceptor, dead_s: Array) -> tuple[Array, A
 def _fit(change: Array, rose: Array) -> _Fit:
     """Student's t of one scale about a threshold for each polarity."""
     theta = np.array([np.median(change[rose]), np.median(change[~rose])])
-    scale = float(np.median(np.abs(change - np.where(rose, *theta))))
+    scale = max(float(np.median(np.abs(change - np.where(rose, *theta)))), LEAST)
     for _ in range(STEPS):
         away = (change - np.where(rose, *theta)) / scale
         weight = (FREEDOM + 1) / (FREEDOM + away**2)
         theta = np.array([np.average(change[side], weights=weight[side]) for side in (rose, ~rose)])
-        scale = float(np.sqrt(np.mean(weight * (change - np.where(rose, *theta)) ** 2)))
+        scale = max(float(np.sqrt(np.mean(weight * (change - np.where(rose, *theta)) ** 2))), LEAST)
     away = (change - np.where(rose, *theta)) / scale
     likely = 0.5 * (FREEDOM + 1) * np.log1p(away**2 / FREEDOM)
     return _Fit(float(np.log(scale) + likely.mean()), theta)

@@ -52,6 +52,13 @@ def test_changes_from_event_to_event_tell_of_a_reset(law: str) -> None:
         assert (found.kept > 1.1 * found.theta).all()
 
 
+def test_noise_between_all_events_leaves_no_changes_to_compare() -> None:
+    dn, dt_s = film(), FRAME_S / STEPS
+    data = sample_of(dn, dead_events(integrated(dn, dt_s, 0.0, 0.0, SUB), dt_s / SUB, "resets"))
+    noisy = data._replace(noise_hz=np.full((1, 2), 1e5, np.float32))
+    assert held_in_reset(noisy, [IDEAL], 1.3 * DEAD_S) is None
+
+
 def test_a_reset_that_sums_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
     """The path's errors may add up in them: of 60 cameras 4 more were recognised, and the worst
     threshold was off by 29 instead of 44 %."""
