@@ -10,7 +10,7 @@ from helpers.films import DEAD_S, FRAME_S, SUB, dead_events, film, integrated, v
 from helpers.samples import events_of, sample_of
 
 from evflow.estimation.refine import lost_contrast as lost_module
-from evflow.estimation.refine.held_in_reset import held_in_reset
+from evflow.estimation.refine.held_in_reset import Anew, held_in_reset
 from evflow.estimation.refine.lost_contrast import lost_contrast
 from evflow.estimation.refine.path import STEPS
 from evflow.estimation.refine.receptor_data import Sample
@@ -100,7 +100,9 @@ def test_intervals_that_are_missing_tell_a_loss_from_an_offset(
     ideal = sample_of(dn, events_of(seen, dt_s / SUB, 0.0, 0.25, 0.2))
     shortest_s = np.quantile(intervals_of(ideal), 0.01) * dt_s
     assert lost_module._too_fast(ideal, find(ideal), 0.7 * shortest_s) < 0.2 * share
-    monkeypatch.setattr(lost_module, "held_in_reset", lambda *_: None)
+    gain = 0.75 * lost_module.SURELY / lost_module._size(kept)
+    unsure = Anew(DEAD_S, np.array([0.25, 0.2]), np.array([0.3, 0.25]), gain, IDEAL)
+    monkeypatch.setattr(lost_module, "held_in_reset", lambda *_: unsure)
     monkeypatch.setattr(lost_module, "find", lambda one: dataclasses.replace(
         find(one), explained=(kept.explained[int(kept.needed)],) * 2))  # as by an offset
     found = [lost_contrast(data, kept, 1.3 * DEAD_S)[1]]
