@@ -115,7 +115,7 @@ def _reset(data: Sample, found: Found, shortest_s: float) -> tuple[Found, Lost |
     """`lost_contrast` of pixels that begin anew. The dead time is that of the changes from event to
     event, unless the path is too wrong for them; the thresholds are those of sums over a pixel's
     events, as far as these tell of a loss."""
-    ways = list(dict.fromkeys((found.ideal, found.used)))
+    ways = _receptors(found)
     unexplained = 1.0 - found.explained[int(found.needed)]
     anew = None
     if unexplained < OPAQUE:
@@ -128,7 +128,7 @@ def _reset(data: Sample, found: Found, shortest_s: float) -> tuple[Found, Lost |
     if anew is None or _size(found) * anew.gain < SURELY or not (
             np.min([anew.theta, anew.kept]) > LEAST):
         return found, None
-    if anew.seen_by != found.used:  # what was found has imitated the loss
+    if anew.seen_by != found.used:
         found = dataclasses.replace(found, chance=1.0 - found.chance)
     theta = anew.theta / (1.0 - LACKING * unexplained)
     return found, Lost("resets", anew.dead_s, anew.kept / anew.theta, theta)
@@ -149,8 +149,7 @@ def _reset_by_sums(
 
 def _dropped(data: Sample, found: Found, edge_s: float) -> tuple[Found, Lost | None]:
     """`lost_contrast` of pixels that drop events."""
-    best = _best(_drops(data, seen_by, edge_s)
-                 for seen_by in dict.fromkeys((found.ideal, found.used)))
+    best = _best(_drops(data, seen_by, edge_s) for seen_by in _receptors(found))
     if _size(found) * best.gain < CLEARLY:
         return found, None
     return _without_loss(data, found, "drops", best, edge_s)
@@ -174,6 +173,11 @@ def _without_loss(
     return (dataclasses.replace(again, theta=again.theta * excess,
                                 ideal_theta=again.ideal_theta * excess),
             Lost(law, way.dead_s, excess, theta))
+
+
+def _receptors(found: Found) -> list[Photoreceptor]:
+    """Those that are tried: what was found may only imitate the loss."""
+    return list(dict.fromkeys((found.ideal, found.used)))
 
 
 def _size(found: Found) -> float:

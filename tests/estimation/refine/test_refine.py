@@ -38,13 +38,11 @@ from evflow.estimation.refine.trace import (
     trace_of_events,
 )
 from evflow.estimation.state import State, add_path
-from evflow.light.log_maps import LINLOG_KNEE, lin_log
+from evflow.light.log_maps import lin_log
 from evflow.recordings import plan_windows
 from evflow.recordings.faulty_pixels import hot_pixels
-from evflow.recordings.glitches import SATURATED_DN
 from evflow.recordings.windows import WindowPlan
 from evflow.scenes import SceneConfig, make_bank
-from evflow.simulator.photoreceptor import Photoreceptor
 from evflow.types import Events
 from experiments.shared.cameras import Protocol, hidden_recording
 
@@ -101,18 +99,6 @@ def test_sightings_are_numbered_as_the_events_of_the_whole_recording() -> None:
     np.testing.assert_array_equal(events.p[seen.number], seen.on)
     np.testing.assert_array_equal(
         events.y[seen.number].astype(int) * width + events.x[seen.number], seen.pixel)
-
-
-@pytest.mark.parametrize("added", [0.0, 8.0])
-def test_pixels_below_the_knee_of_the_lin_log_map_are_not_compared(added: float) -> None:
-    """There half a DN of noise is .075 log units: of a dark scene of low thresholds, simulated with
-    its noise, theta_off came out 12 % too high, and 31 % with 1 DN of noise."""
-    light = np.broadcast_to(np.linspace(0, 255, 32, dtype=np.uint8), (3, 24, 32))
-    one = np.array([0, 50_000])
-    events = Events(one % 7, one % 7, one, np.array([True, False]), (32, 24))
-    seen_by = Photoreceptor(offset_dn=added)
-    chunk = make_chunk(Recording(events, light, 25_000 * np.arange(3)), (0, 1), seen_by=seen_by)
-    assert (chunk.bright == ((light[0] + added >= LINLOG_KNEE) & (light[0] <= SATURATED_DN))).all()
 
 
 def test_every_event_is_counted_once(events: Events) -> None:
