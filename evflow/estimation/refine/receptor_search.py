@@ -86,7 +86,9 @@ def find(data: Sample) -> Found | None:
 
 def _with_map(data: Sample) -> tuple[Regression, np.ndarray, float] | None:
     """The more probable log map, its most probable constants, and the effective number of events;
-    None where no threshold follows from them. The maps differ in dark light alone."""
+    None where no threshold follows from them. The maps differ in dark light alone. Each divides the
+    events at noise in its own way, and another one must be the better with both: what is divided
+    more finely is explained better by any map."""
     begun = _begin(data, "linlog")
     if begun is None or _dark(data) < DARK:
         return begun
@@ -94,8 +96,11 @@ def _with_map(data: Sample) -> tuple[Regression, np.ndarray, float] | None:
     other = _begin(data, "log_eps", np.where(OFFSET, 0.0, phi))
     if other is None:
         return begun
-    size = _worth(other[1], other[0], min(size, BELIEVED))
-    gain = _value(phi, model, size) - _value(other[1], other[0], size)
+    rival, there, _ = other
+    size = _worth(there, rival, min(size, BELIEVED))
+    gain = min(_value(phi, dataclasses.replace(model, data=divided), size)
+               - _value(there, dataclasses.replace(rival, data=divided), size)
+               for divided in (rival.data, model.data))
     return other if gain > OTHER_MAP + small_sample_odds(data) else begun
 
 

@@ -18,7 +18,7 @@ from helpers.films import (
 )
 from helpers.samples import NONE_HOT, looked_at, no_readouts
 
-from evflow.estimation.refine import receptor_search
+from evflow.estimation.refine import receptor_prior, receptor_search
 from evflow.estimation.refine.path import STEPS
 from evflow.estimation.refine.receptor_data import Sample, sample
 from evflow.estimation.refine.receptor_prior import FEW, FEWER, small_sample_odds
@@ -95,6 +95,21 @@ def test_dark_light_shows_which_logarithm_it_is(
 
 def test_bright_light_does_not() -> None:
     assert find(looked_at(0.0, 0.0, log=log_eps)).seen.log_map == "linlog"
+
+
+@pytest.mark.parametrize(("gain", "log", "name"), [
+    (0.15, lin_log, "linlog"), (0.25, log_eps, "log_eps")])
+def test_logarithms_are_compared_on_the_same_groups_of_events(
+    monkeypatch: pytest.MonkeyPatch, gain: float, log: Callable[[np.ndarray], np.ndarray], name: str
+) -> None:
+    """Each divides a pixel's events at other ones as noise. Of the groups by log_eps either map
+    explains more than of those by lin-log in the first case, and less in the second."""
+    data = looked_at(0.0, 30.0, gain=gain, log=log, noise_hz=5.0)
+    monkeypatch.setattr(receptor_prior, "FEW", 1.0)
+    found = find(data._replace(noise_hz=np.full((1, 2), 5.0, np.float32)))
+    assert found.seen.log_map == name
+    assert found.seen.cutoff_hz == pytest.approx(30.0, rel=0.1)
+    np.testing.assert_allclose(found.theta, [0.25, 0.2], rtol=0.08)
 
 
 @pytest.mark.parametrize(("asked", "kept"), [(0.0, True), (1e6, False)])
