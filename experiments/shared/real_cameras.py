@@ -49,6 +49,9 @@ CHANGES: dict[str, dict[str, Any]] = {
     "shot noise 1 Hz, mismatch .15": {
         "model": SensorModel(shot_hz=1.0, noise_resets_memory=True),
         "prior": dataclasses.replace(BASE.prior, mismatch=(0.15, 0.15))},
+    "noise independent of θ": {"prior": dataclasses.replace(
+        BASE.prior, noise="independent", eta=(0.005, 2.0))},
+    "no noise": {"prior": dataclasses.replace(BASE.prior, noise="none")},
     "v2e's noisy": {"model": SENSORS["noisy"].model, "exact": False},
     "as a real camera": {"model": REAL, "exposure_ms": 10, "frame_noise_dn": 2.0, "black_dn": 4.0},
     "DVS-Voltmeter's DVS346": {"model": SENSORS["dvs346"].model},
