@@ -22,7 +22,7 @@ Array = jax.Array
 # Relative increase of the variance for each feature outside of training's range; measured on
 # recordings of up to 8 s.
 VARIANCE_PER_OUTLIER_FEATURE = 0.04
-# Hz, the lowest noise rate of training's cameras, of half of which the noise follows the thresholds
+# Hz, the lowest noise rate of training's cameras, of most of which the noise follows the thresholds
 # (Eq. 12): in quieter ones it would be taken for high thresholds.
 LEAST_NOISE_HZ = 0.02
 
