@@ -49,7 +49,7 @@ def _enough(numbers: dict[str, Any]) -> list[Judged]:
 
 
 def _times(numbers: dict[str, Any]) -> list[Judged]:
-    """How events follow each other, and how many come without company."""
+    """How events follow each other, and how many are isolated."""
     judged = []
     slow = [kind for kind in TIMES if graded(numbers[kind]["wasserstein_decades"] or 0.0, APART)
             != "good"]
@@ -66,7 +66,7 @@ def _times(numbers: dict[str, Any]) -> list[Judged]:
         return judged
     gap = abs(real - made)
     judged.append(Judged(
-        graded(gap, (0.1, 0.3)), "", gap / 0.1, f"Events without company, mostly noise: {real:.0%} "
+        graded(gap, (0.1, 0.3)), "", gap / 0.1, f"Isolated events, mostly noise: {real:.0%} "
         f"recorded, {made:.0%} synthetic.", advice="" if gap <= 0.1 else
         f"{'Raise' if real > made else 'Lower'} the noise rates of the simulation."))
     return judged

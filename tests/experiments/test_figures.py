@@ -33,8 +33,12 @@ def readme() -> dict[str, Figures]:
             *of("theta", "mae_sequence"), *of("theta", "constant truth"),
             mean("evaluate", r"0.03\|theta", "paper")],
         "threshold of each pixel": [*of("theta", "mae_pixel"), *of("theta", "constant truth")],
-        "noise rate (Hz)": [*of("eta", "refined"), mean("evaluate", r"0.03\|eta", "constant prior"),
-                            mean("evaluate", r"0.03\|eta", "paper")],
+        "noise rate that follows θ, Eq. 12": [
+            *of("eta", "refined"), mean("evaluate", r"0.03\|eta", "constant prior"),
+            mean("evaluate", r"0.03\|eta", "paper")],
+        "noise rate independent of θ": [
+            mean("evaluate", r"0.03 free noise\|eta", column)
+            for column in ("refined", "constant prior")],
         "68 % / 95 % intervals of θ": [*held_of_theta(), *all_cameras()],
     }
 
@@ -128,8 +132,9 @@ def curves() -> dict[str, Figures]:
     def of(rows: str) -> list[float]:
         return values("curves", rows, "theta, refined")
 
-    events = [of(rf"signal events\|{most}\|")[0] for most in (200, 1000, 3000, 1_000_000)]
-    return {"`curves`": events, "frame interval": [5, 100, *sorted(
+    events = [of(rf"signal events\|{most}\|")[0]
+              for most in (200, 1000, 3000, 10_000, 1_000_000)]
+    return {"mean error of θ |": events, "frame interval": [5, 100, *sorted(
         (max(of("frame interval")), min(of("frame interval"))), reverse=True)],
         "duration": [50, 800, *sorted(
             (max(of("duration")), min(of("duration"))), reverse=True)]}
@@ -328,8 +333,8 @@ def eventgan() -> dict[str, Figures]:
 
 
 def losses() -> dict[str, Figures]:
-    rows = {"L_P |": ("L_P", 8), "+ L_F": (r"L_P \+ L_F \+ L_F'", 12),
-            "+ L_E": (r"L_P \+ L_E", 16), "all |": (r"L_P \+ L_F \+ L_F' \+ L_E", 20),
+    rows = {"L_P |": ("L_P", 8), "L_P + L_F": (r"L_P \+ L_F \+ L_F'", 12),
+            "L_P + L_E": (r"L_P \+ L_E", 16), "all |": (r"L_P \+ L_F \+ L_F' \+ L_E", 20),
             "all, weights": ("the same, weights adapted", 24)}
 
     def gain(source: str, name: str) -> Figures:

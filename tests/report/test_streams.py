@@ -347,11 +347,11 @@ def test_too_little_is_not_called_alike() -> None:
     assert "Only 3.0% of the shorter stream's time" in describe_streams(numbers)
 
 
-def test_silence_has_no_share_of_lonely_events() -> None:
+def test_silence_has_no_share_of_isolated_events() -> None:
     first, second = edge(), dataclasses.replace(edge(), t=edge().t + 1)
     numbers = evflow.compare(first, second, span_us=(0, 1))
     assert numbers["events"] == {"real": 2, "synthetic": 0}
-    assert "without company" not in describe_streams(numbers)
+    assert "Isolated events" not in describe_streams(numbers)
 
 
 def test_swapped_polarity_is_named() -> None:
