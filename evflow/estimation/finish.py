@@ -35,7 +35,7 @@ from evflow.estimation.remarks import (
 )
 from evflow.estimation.result import CameraEstimate
 from evflow.estimation.shot import Shot, at_mean_light, measured_noise, measured_shot, scatter
-from evflow.estimation.state import Advance, State, summary_so_far, windows_of
+from evflow.estimation.state import Advance, State, summary_so_far, windows_of, with_a_chunk
 from evflow.files.spool import forget
 from evflow.notes import Note
 from evflow.recordings.check.contents import VALID_EVENTS
@@ -70,6 +70,7 @@ class Known:
 def starting(state: State) -> Known:
     """The camera's summary before it is refined, and the chunks of the path between frames, if
     there is one, on which it is."""
+    state = with_a_chunk(state)
     summary, std = summary_so_far(state)
     found = state.front_end.found
     optics = found.optics if found else None
@@ -107,8 +108,7 @@ def estimate(
     front_end, n_events = state.front_end, state.n_events.astype(np.uint32)
     refined = refine(state)
     hot, dead, summary, std = refined.hot, refined.dead, refined.summary, refined.std
-    pooled_hot = hot if front_end.faulty is None else hot & ~front_end.faulty
-    stats = without_those(state.stats, state.sent[:, pooled_hot].sum(1))
+    stats = without_those(state.stats, state.pooled[:, hot].sum(1))
     alone: tuple[str, ...] = ()
     if lacking := undetermined(stats, summary):
         summary, std, alone = with_prior(lacking, list(refined.chunks), summary, std)

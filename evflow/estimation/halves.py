@@ -15,8 +15,7 @@ import numpy as np
 from evflow.estimation.dead_time import dead_time, first_events
 from evflow.estimation.finish import estimate
 from evflow.estimation.front_end import settled
-from evflow.estimation.refine import Stretch, find_photoreceptor, make_chunk, simulated_part
-from evflow.estimation.refine.path import STEPS
+from evflow.estimation.refine import Stretch, find_photoreceptor
 from evflow.estimation.refine.photoreceptor import receptor_places
 from evflow.estimation.refine.stretches import spread
 from evflow.estimation.result import CameraEstimate
@@ -92,14 +91,9 @@ def _on_its_own(first: FirstPart) -> State:
     seen_by = found.used if found is not None else IDEAL
     own = dataclasses.replace(front_end, seen_by=seen_by, found=found,
                               dead=settled(dead, lost), lost=lost, films={})
-    simulated = spread([len(s.run) for s in state.read], max(len(state.chunks), 1))
     if seen_by != front_end.seen_by:
+        simulated = spread([len(s.run) for s in state.read], max(len(state.chunks), 1))
         state = State(state.params, own)
         for i, stretch in enumerate(first.state.read):
             state = add(state, stretch, simulate=i in simulated)
-    elif not state.chunks:
-        stretch = state.read[simulated[0]]
-        place = stretch.recording, stretch.run
-        chunk = make_chunk(*place, STEPS, seen_by, front_end.noise_dn, first=stretch.first)
-        state = dataclasses.replace(state, chunks=(simulated_part(chunk, place, seen_by),))
     return dataclasses.replace(state, front_end=own)

@@ -94,25 +94,36 @@ def window_counts(window: Window) -> tuple[np.ndarray, np.ndarray]:
 
 def window_stats(
     params: api.Params, window: Window, seen_by: Photoreceptor = IDEAL,
-    faulty: np.ndarray | None = None,
+    counted: np.ndarray | None = None,
 ) -> api.Stats:
-    """Stats of the pixels that a window's frames show, or of all if they show none, without faulty
-    ones (H, W). Large sensors go band by band, whose sums add."""
+    """Stats of the pixels counted (H, W), by default `pooled_pixels`. Large sensors go band by
+    band, whose sums add."""
     shape = window.frame0.shape
-    faulty = np.zeros(shape, bool) if faulty is None else faulty
+    counted = pooled_pixels(window) if counted is None else counted
     if shape[0] * shape[1] <= LARGE:
-        return _stats(params, window, seen_by, faulty)
+        return _stats(params, window, seen_by, counted)
     return functools.reduce(operator.add, (
-        _stats(params, rows_of(window, rows), seen_by, faulty[rows])
+        _stats(params, rows_of(window, rows), seen_by, counted[rows])
         for rows in bands(shape, BAND)))
 
 
+def pooled_pixels(window: Window, faulty: np.ndarray | None = None) -> np.ndarray:
+    """(H, W) bool: pixels that a window's frames show, or all of them if they show none (of a large
+    sensor: of a band), without faulty ones (H, W)."""
+    shown = exposed(window.frame0, window.frame1)
+    large = shown.size > LARGE
+    for rows in bands(shown.shape, BAND) if large else [slice(None)]:
+        if not shown[rows].any():
+            shown[rows] = True
+    return shown if faulty is None else shown & ~faulty
+
+
 def _stats(
-    params: api.Params, window: Window, seen_by: Photoreceptor, faulty: np.ndarray
+    params: api.Params, window: Window, seen_by: Photoreceptor, counted: np.ndarray
 ) -> api.Stats:
-    """Quiet pixels of the same brightness go through the network once, with their number."""
-    shown = exposed(window.frame0, window.frame1).ravel()
-    counted = (shown if shown.any() else ~shown) & ~faulty.ravel()
+    """Of the pixels counted (H, W); quiet ones of the same brightness go through the network once,
+    with their number."""
+    counted = counted.ravel()
     frames = np.stack([_light(f, seen_by).ravel() for f in (window.frame0, window.frame1)], 1)
     pixels, voxels = fired_voxels(window.events, window.t0_us, window.t1_us - window.t0_us)
     quiet = counted.copy()

@@ -16,10 +16,11 @@ import numpy as np
 from evflow.camera import Summary
 from evflow.estimation import drift, maps
 from evflow.estimation.front_end import FrontEnd
-from evflow.estimation.pooled import window_counts, window_stats
+from evflow.estimation.pooled import pooled_pixels, window_counts, window_stats
 from evflow.estimation.refine import Chunk, PixelEvidence, Stretch, make_chunk, simulated_part
 from evflow.estimation.refine.chunk import without_evidence
 from evflow.estimation.refine.path import STEPS, of_place
+from evflow.estimation.refine.stretches import spread
 from evflow.network import api
 from evflow.process.memory import give_back
 from evflow.recordings.faulty_pixels import hot_in_stretch
@@ -33,14 +34,15 @@ Advance = Callable[[], None]
 @dataclasses.dataclass(frozen=True, eq=False)
 class State:
     """params: of the network. stats, sent (2, H, W), n_shown (H, W), evidence, quiet (4, H, W):
-    sums over all that was read; chunks: stretches to simulate; read: stretches whose quiet time is
-    counted at the end; windows, seconds: amounts read; parts: of each stretch, what drift.py
-    compares."""
+    sums over all that was read; pooled: (2, H, W) events that are in stats; chunks: stretches to
+    simulate; read: stretches whose quiet time is counted at the end; windows, seconds: amounts
+    read; parts: of each stretch, what drift.py compares."""
 
     params: api.Params
     front_end: FrontEnd
     stats: api.Stats | None = None
     sent: Array = dataclasses.field(default_factory=lambda: np.zeros((2, 1, 1)))
+    pooled: Array = dataclasses.field(default_factory=lambda: np.zeros((2, 1, 1)))
     n_shown: Array = dataclasses.field(default_factory=lambda: np.zeros(()))
     evidence: PixelEvidence | None = None
     quiet: Array | None = None
@@ -87,17 +89,19 @@ def read_stretch(
         advance: called after every window, and after the stretch.
     """
     give_back()
-    stats, sent, n_shown = None, np.zeros((2, 1, 1)), np.zeros(())
+    front_end, stats, n_shown = state.front_end, None, np.zeros(())
+    sent, pooled = np.zeros((2, 1, 1)), np.zeros((2, 1, 1))
     for number, window in enumerate(windows_of([stretch])):
-        if number % every == 0:
-            front_end = state.front_end
-            more = window_stats(state.params, window, front_end.seen_by, front_end.faulty)
-            stats = more if stats is None else stats + more
         counts, shown = window_counts(window)
+        if number % every == 0:
+            counted = pooled_pixels(window, front_end.faulty)
+            more = window_stats(state.params, window, front_end.seen_by, counted)
+            stats = more if stats is None else stats + more
+            pooled = pooled + counts * counted
         sent, n_shown = sent + counts, n_shown + shown
         advance()
     read = State(
-        state.params, state.front_end, stats, sent, n_shown, read=(stretch,),
+        state.params, state.front_end, stats, sent, pooled, n_shown, read=(stretch,),
         windows=len(stretch.windows), seconds=1e-6 * (stretch.span_us[1] - stretch.span_us[0]))
     if not stretch.run:
         return read
@@ -122,6 +126,18 @@ def add_path(state: State, stretch: Stretch, *, simulate: bool) -> State:
                   parts=(drift.part(stretch.span_us, chunk.evidence.without(hot)),))
     del chunk  # a film of the whole sensor
     return state + added
+
+
+def with_a_chunk(state: State) -> State:
+    """The state with one of its longest stretches to simulate where there is a path and none of
+    those chosen was read before reading ended."""
+    if state.quiet is None or state.chunks:
+        return state
+    stretch = state.read[spread([len(s.run) for s in state.read], 1)[0]]
+    place, seen_by = (stretch.recording, stretch.run), state.front_end.seen_by
+    chunk = make_chunk(*place, STEPS, seen_by, state.front_end.noise_dn, first=stretch.first)
+    kept = without_evidence(simulated_part(chunk, place, seen_by))
+    return dataclasses.replace(state, chunks=(kept,))
 
 
 def summary_so_far(state: State) -> tuple[Summary, Summary]:

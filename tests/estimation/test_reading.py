@@ -7,13 +7,16 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.networks import hidden
+from helpers.networks import hidden, small_params
 
 from evflow import Recording, estimate_camera
 from evflow.estimation import drift, reading
+from evflow.estimation.front_end import find_front_end
 from evflow.estimation.halves import divided
 from evflow.estimation.refine import chunk, cut, make_chunk, path
 from evflow.estimation.refine import stretches as cutting
+from evflow.estimation.refine.frame_exposure import UNSEEN
+from evflow.estimation.state import State, read_stretch
 from evflow.recordings.windows import plan_windows
 from evflow.types import Events
 
@@ -192,3 +195,37 @@ def test_until_ends_reading_and_nothing_is_lost(monkeypatch: pytest.MonkeyPatch)
     assert found.extent.of == 3
     assert "reading.ended" in [note.code for note in found.notes]
     assert found.windows == 4
+
+
+def test_reading_may_end_before_a_stretch_that_is_simulated(
+    monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One of three stretches is simulated, the middle one; the estimate ends after the first."""
+    recording, camera = hidden(3)
+    monkeypatch.setattr(cutting, "INTERVALS", 2)
+    monkeypatch.setattr(reading, "most_simulated", lambda _: 1)
+    found = estimate_camera(recording, pixel="ideal", until=lambda *_: True)
+    assert found.extent.stretches == 1
+    theta = float(np.median(camera.theta_on))
+    assert abs(float(found.summary.theta_on) - theta) < 3 * float(found.summary_std.theta_on)
+    alone = estimate_camera(Recording(
+        recording.events.slice(int(recording.events.t[0]), int(recording.frame_times[2])),
+        recording.frames[:3], recording.frame_times[:3]), pixel="ideal")
+    np.testing.assert_allclose(found.summary.theta_on, alone.summary.theta_on, rtol=1e-3)
+
+
+@pytest.mark.parametrize("every", [1, 2])
+def test_events_of_a_pixel_are_counted_as_they_were_pooled(every: int) -> None:
+    """Those of a hot pixel are taken out of the statistics again, and only those: of a long
+    recording every second window is pooled, and not where frames are black."""
+    recording, _ = hidden(3)
+    frames = recording.frames.copy()
+    frames[3:, :8] = 0
+    recording = dataclasses.replace(recording, frames=frames)
+    stretches = cut(recording, plan_windows(recording))
+    front_end = find_front_end(stretches, UNSEEN, measured=False)
+    read = read_stretch(State(small_params(), front_end), stretches[0], simulate=False,
+                        every=every)
+    for k, name in enumerate(("events_on", "events_off")):
+        assert float(getattr(read.stats, name)) == read.pooled[k].sum()
+    assert read.pooled.sum() < read.sent.sum() / (0.8 * every)
