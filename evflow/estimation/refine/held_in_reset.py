@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evflow.estimation.refine.fine_steps import later
 from evflow.estimation.refine.receptor_data import Sample, one_stretch
 from evflow.estimation.refine.receptor_noise import path_of, split_at_noise
 from evflow.simulator.photoreceptor import Photoreceptor
@@ -85,11 +86,10 @@ def _fits(data: Sample, seen_by: Photoreceptor, dead_s: Array) -> list[_Fit]:
 def _changes(d: Sample, seen_by: Photoreceptor, dead_s: Array) -> tuple[Array, Array]:
     """(K, M) change of the path of one stretch from the end of each dead time after an event to the
     pixel's next one, positive in that event's direction; and (M,) whether that is ON."""
-    step_s, path = float(np.mean(d.dt_s)), path_of(d, seen_by)
+    path = path_of(d, seen_by)
     used = np.flatnonzero(d.weight > 0)
     pixel, group, on, clear = d.pixel[used], d.group[used], d.on[used], d.weight[used] > CLEAR
-    at = np.clip(d.at[used].astype(np.float64) - seen_by.delay_s / step_s,
-                 0.0, len(path) - 1 - 1e-3)
+    at = np.minimum(later(d.at[used], d.dt_s, -seen_by.delay_s), len(path) - 1 - 1e-3)
     pair = np.flatnonzero((np.diff(group) == 0) & clear[1:] & clear[:-1])
     rose = on[pair + 1] > on[pair]
 
@@ -100,7 +100,7 @@ def _changes(d: Sample, seen_by: Photoreceptor, dead_s: Array) -> tuple[Array, A
 
     first, then = at[pair], at[pair + 1]
     end = light(then)
-    rows = np.stack([end - light(np.minimum(first + seconds / step_s, then))
+    rows = np.stack([end - light(np.minimum(later(first, d.dt_s, seconds), then))
                      for seconds in dead_s])
     return np.where(rose, rows, -rows), np.asarray(rose)
 

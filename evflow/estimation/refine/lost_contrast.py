@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera.sensors import DeadContrast
+from evflow.estimation.refine.fine_steps import later
 from evflow.estimation.refine.held_in_reset import held_in_reset
 from evflow.estimation.refine.receptor_data import Sample, one_stretch
 from evflow.estimation.refine.receptor_noise import path_of
@@ -246,11 +247,10 @@ def _without(
 
 def _lost(d: Sample, seen_by: Photoreceptor, dead_s: float, theta: Array | None) -> Array:
     """(N,) of one stretch."""
-    step_s, path = float(np.mean(d.dt_s)), path_of(d, seen_by)
+    dt_s, path = d.dt_s, path_of(d, seen_by)
     used = np.flatnonzero(d.weight > 0)
     pixel = np.asarray(d.pixel)[used]
-    at = np.clip(np.asarray(d.at, np.float64)[used] - seen_by.delay_s / step_s,
-                 0.0, len(path) - 1 - 1e-3)
+    at = np.minimum(later(d.at[used], dt_s, -seen_by.delay_s), len(path) - 1 - 1e-3)
 
     def light(when: Array) -> Array:
         step = when.astype(np.int64)
@@ -259,7 +259,7 @@ def _lost(d: Sample, seen_by: Photoreceptor, dead_s: float, theta: Array | None)
 
     first = np.diff(pixel, prepend=-1) != 0
     last = np.where(first, at, np.roll(at, 1))
-    change = light(np.minimum(last + dead_s / step_s, at)) - light(last)
+    change = light(np.minimum(later(last, dt_s, dead_s), at)) - light(last)
     if theta is not None:
         each = np.where(change > 0, *theta)
         change = np.trunc(change / each) * each

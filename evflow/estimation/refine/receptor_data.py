@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from evflow.camera.sensors import LogMap
+from evflow.estimation.refine.fine_steps import seconds_at
 from evflow.estimation.refine.net_changes import Changes, changes, joined, offset_by_changes
 from evflow.estimation.refine.sightings import Sightings, counts_so_far, path_weights
 from evflow.estimation.refine.smear import smeared
@@ -121,9 +122,9 @@ def smeared_sample(data: Sample, seconds: float) -> Sample:
     weight, pixel, at = (np.asarray(a) for a in (data.weight, data.pixel, data.at))
     for c, dt_s in enumerate(np.asarray(data.dt_s)):
         used = np.flatnonzero(weight[c] > 0)
-        place = pixel[c, used], at[c, used]
+        place = pixel[c, used], seconds_at(at[c, used], dt_s)
         for counts in (on[c], off[c]):
-            counts[used] = smeared(*place, counts[used], seconds / float(dt_s.mean()))
+            counts[used] = smeared(*place, counts[used], seconds)
     return data._replace(on=jax.device_put(on), off=jax.device_put(off))
 
 
@@ -135,7 +136,7 @@ def _row(
     steps = len(dt_s) // (len(s.frames) - 1)
     at = (s.interval + s.fraction) * steps
     group, on, off = counts_so_far(s)
-    weight = path_weights(s) * (at > SETTLE_S / dt_s.mean())
+    weight = path_weights(s) * (seconds_at(at, dt_s) > SETTLE_S)
     pixels = s.pixel[s.first]
     chosen = np.flatnonzero(np.bincount(group, weight > 0, len(pixels)) >= 2)
     if len(chosen) > PIXELS:

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from evflow.estimation.refine.fine_steps import later, seconds_at
 from evflow.estimation.refine.receptor_data import Sample, one_stretch
 from evflow.estimation.refine.sightings import TYPICAL_THETA
 from evflow.simulator.photoreceptor import FAST, Photoreceptor, seen_path
@@ -44,13 +45,14 @@ def split_at_noise(data: Sample, seen_by: Photoreceptor, theta: Array | None = N
 
 def _groups(d: Sample, seen_by: Photoreceptor, noise_hz: Array, theta: Array) -> Array:
     """(N,) int32 groups of one stretch."""
-    step_s, path = float(np.mean(d.dt_s)), path_of(d, seen_by)
+    path = path_of(d, seen_by)
     used = np.flatnonzero(np.asarray(d.weight) > 0)
     at, pixel, on, part = (np.asarray(v)[used] for v in (d.at, d.pixel, d.on, d.group))
     last = len(path) - 1
-    step = np.clip(at - seen_by.delay_s / step_s, 0, last - 1).astype(np.int64)
+    step = np.minimum(later(at, d.dt_s, -seen_by.delay_s), last - 1).astype(np.int64)
     low, high = np.maximum(step - REACH, 0), np.minimum(step + 1 + REACH, last)
-    slope = (path[high, pixel] - path[low, pixel]) / ((high - low) * step_s)
+    slope = (path[high, pixel] - path[low, pixel]) / (
+        seconds_at(high, d.dt_s) - seconds_at(low, d.dt_s))
     new = np.diff(pixel, prepend=-1) != 0
     rose = np.where(new, on > 0, np.diff(on, prepend=0.0) > 0)
     side = np.where(rose, 0, 1)

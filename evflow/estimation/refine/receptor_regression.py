@@ -126,7 +126,7 @@ def _products(
     blocks = data.dn.shape[0] * TILES[0] * TILES[1]
 
     def one(d: Sample) -> Array:
-        step_s = d.dt_s.mean()
+        step_s = d.dt_s[jnp.minimum(d.at.astype(jnp.int32), len(d.dt_s) - 1)]
         at = jnp.clip(d.at - phi[2] / step_s, 0.0, len(d.dt_s) - 1e-3)
         step = jnp.floor(at).astype(jnp.int32)
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from evflow.camera import Camera
 from evflow.camera.sensors import SensorModel
+from evflow.estimation.refine.fine_steps import evenly, seconds_at
 from evflow.estimation.refine.lost_contrast import LEAST, NEGLIGIBLE, Lost
 from evflow.estimation.refine.receptor_data import Sample, one_stretch
 from evflow.estimation.refine.receptor_noise import path_of
@@ -37,7 +38,8 @@ def kept_contrast(data: Sample, found: Found, dead_s: float) -> Lost | None:
     for c in range(len(data.dn)):
         d = one_stretch(data, c)
         path = path_of(d, found.used)
-        paths.append((np.maximum(path - path.max(), DARKEST), float(np.mean(d.dt_s))))
+        even = evenly(np.maximum(path - path.max(), DARKEST), d.dt_s)
+        paths.append((even, float(np.mean(d.dt_s))))
     sent = _counted(paths, found.theta, dead)
     if sent.min() < ENOUGH:
         return None
@@ -68,7 +70,7 @@ def without_waiting(data: Sample, dead_s: float) -> Sample:
     for c, dt_s in enumerate(np.asarray(data.dt_s)):
         used = np.flatnonzero(weight[c] > 0)
         pixel, at = (np.asarray(v)[c, used] for v in (data.pixel, data.at))
-        after = np.diff(at, prepend=-np.inf) * dt_s.mean()
+        after = np.diff(seconds_at(at, dt_s), prepend=-np.inf)
         waited = (np.diff(pixel, prepend=-1) == 0) & (after < WAITED * dead_s)
         weight[c, used[waited]] *= HARDLY
     return data._replace(weight=jnp.asarray(weight))
