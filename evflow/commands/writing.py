@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from evflow.errors import EvflowDataError
-from evflow.files.atomic import need_no_folder
+from evflow.files.atomic import need_no_file, need_no_folder
 
 Format = Literal["auto", "dsec", "e2vid", "event_utils", "evreal", "npz", "aedat4", "aedat2"]
 
@@ -45,11 +45,12 @@ def need_suffix(out: Path, suffix: str) -> None:
 
 
 def need_folder(out: Path) -> None:
-    """Raise EV020 if a folder to be created has the name of a file."""
+    """Raise EV020 if a folder to be created has the name of a file, EV013 if it is one."""
     refuse_stdout(out)
     if out.suffix.lower() in FILES and not out.is_dir():
         raise EvflowDataError("EV020", f"{out} has the name of a file, but a folder is written.",
                               f"Name a folder: -o {out.with_suffix('')}/.")
+    need_no_file(out)
 
 
 def _part_of(path: Path, source: Path) -> bool:

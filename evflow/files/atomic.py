@@ -65,6 +65,27 @@ def need_no_folder(path: str | os.PathLike) -> None:
                               "written.", "Choose another output.", where=path)
 
 
+def need_no_file(path: str | os.PathLike) -> None:
+    """Raise EV013 where a folder is to be written but a file lies: it is not replaced by a
+    folder."""
+    if os.path.exists(path) and not os.path.isdir(path):
+        raise EvflowDataError("EV013", f"{path} is a file, and a folder of that name would be "
+                              "written.", "Choose another output.", where=path)
+
+
+@contextlib.contextmanager
+def disk_errors(path: str | os.PathLike) -> Iterator[None]:
+    """Raise EV019 where the disk is full or `path` cannot be written."""
+    try:
+        yield
+    except OSError as e:
+        if e.errno in REASONS:
+            raise EvflowDataError(
+                "EV019", f"{path} was not written ({REASONS[e.errno]}).",
+                "Nothing is left behind; free space or choose another output.", where=path) from e
+        raise
+
+
 def atomic_text(path: str | os.PathLike, data: str | bytes, *, overwrite: bool = False) -> None:
     """Write text or bytes and read them back before the rename; as `atomic_write`."""
     with atomic_write(path, overwrite=overwrite) as temporary:
@@ -87,19 +108,14 @@ def written_aside(
             where=path)
     temporary = aside(path, "tmp")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with contextlib.suppress(FileNotFoundError):
-            os.lstat(path)  # fails early for a name that is too long
-        clear_leftovers(path)
-        yield temporary
-        with uninterrupted():
-            move(temporary, path, overwrite)
-    except OSError as e:
-        if e.errno in REASONS:
-            raise EvflowDataError(
-                "EV019", f"{path} was not written ({REASONS[e.errno]}).",
-                "Nothing is left behind; free space or choose another output.", where=path) from e
-        raise
+        with disk_errors(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with contextlib.suppress(FileNotFoundError):
+                os.lstat(path)  # fails early for a name that is too long
+            clear_leftovers(path)
+            yield temporary
+            with uninterrupted():
+                move(temporary, path, overwrite)
     finally:
         with uninterrupted():
             remove(temporary)

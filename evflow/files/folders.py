@@ -11,8 +11,9 @@ from pathlib import Path
 from evflow.errors import EvflowDataError
 from evflow.files.atomic import (
     aside,
-    atomic_write,
     clear_leftovers,
+    disk_errors,
+    need_no_file,
     need_no_folder,
     written_aside,
 )
@@ -37,11 +38,11 @@ def atomic_folder(
         if overwrite and path.is_dir():
             _refuse_foreign(path, names)  # again: the block may have taken hours
             swap_folders(temporary, path, aside(path, "old"))
-        elif overwrite:
-            os.replace(temporary, path)
         else:
+            need_no_file(path)
             move_new(temporary, path)
 
+    need_no_file(path)
     _refuse_foreign(path, names)
     with written_aside(path, move, overwrite=overwrite) as temporary:
         temporary.mkdir()
@@ -64,10 +65,11 @@ def staged(folder: str | os.PathLike, *, names: Sequence[str], overwrite: bool =
     names: all files that the block may write. Those already in `folder` are removed, so that no
     stale file lies beside the new ones; other files stay. Of several processes each moves its files
     while the others wait.
-    Raises EV013 if one of them is a folder, or exists and `overwrite` is false; EV019 if the folder
-    cannot be written.
+    Raises EV013 if one of them is a folder, or exists and `overwrite` is false, or if `folder` is a
+    file; EV019 if the folder cannot be written.
     """
     folder = Path(folder)
+    need_no_file(folder)
     for name in names:
         need_no_folder(folder / name)
     if not overwrite and (old := [name for name in names if (folder / name).exists()]):
@@ -76,9 +78,10 @@ def staged(folder: str | os.PathLike, *, names: Sequence[str], overwrite: bool =
     stage = aside(folder / "stage", "tmp")
     new = not folder.exists()
     try:
-        need_writable(folder)  # before any long work
-        clear_leftovers(folder / "stage")
-        stage.mkdir()
+        with disk_errors(folder):  # before any long work
+            folder.mkdir(parents=True, exist_ok=True)
+            clear_leftovers(folder / "stage")
+            stage.mkdir()
         yield stage
         with _alone(folder), uninterrupted():
             _unstage(stage, folder, names, overwrite=overwrite)
@@ -88,13 +91,6 @@ def staged(folder: str | os.PathLike, *, names: Sequence[str], overwrite: bool =
             if new:
                 with contextlib.suppress(OSError):  # unless something was written
                     folder.rmdir()
-
-
-def need_writable(folder: Path) -> None:
-    """Make the folder, and raise EV019 where no file can be written into it."""
-    with atomic_write(folder / ".probe", overwrite=True) as probe:
-        probe.touch()
-    (folder / ".probe").unlink(missing_ok=True)
 
 
 @contextlib.contextmanager

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -350,3 +351,25 @@ def test_an_interrupt_leaves_no_half_removed_folder(
     with pytest.raises(KeyboardInterrupt):
         moves.remove(folder)
     assert not folder.exists()
+
+
+@pytest.mark.parametrize("folder", [
+    lambda path: staged(path, names=("x",), overwrite=True),
+    lambda path: atomic_folder(path, names=("x",), overwrite=True)], ids=["staged", "atomic"])
+def test_a_file_where_a_folder_is_written_is_refused_before_any_work(
+    tmp_path: Path, folder: Callable[[Path], Any]
+) -> None:
+    (tmp_path / "out").write_text("dear to me")
+    with pytest.raises(EvflowDataError, match=r"EV013.*is a file"), folder(tmp_path / "out"):
+        pytest.fail("the work began")
+    assert (tmp_path / "out").read_text() == "dear to me"
+
+
+def test_a_staged_folder_keeps_every_other_file(tmp_path: Path) -> None:
+    for name in (".probe", ".stage", "stage"):
+        (tmp_path / name).write_text("dear to me")
+    with staged(tmp_path, names=("x",)) as stage:
+        (stage / "x").write_text("new")
+    assert sorted(p.name for p in tmp_path.iterdir()) == [".probe", ".stage", "stage", "x"]
+    assert {(tmp_path / name).read_text() for name in (".probe", ".stage", "stage")} == {
+        "dear to me"}
