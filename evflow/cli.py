@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import gc
+import os
 import shlex
 import sys
 from collections.abc import Sequence
@@ -108,14 +109,23 @@ def main(argv: list[str] | None = None) -> int:
         unread()
         return 0
     except OSError as e:
-        name, why = e.filename or "the output", REASONS.get(e.errno or 0, e.strerror or str(e))
-        print(EvflowDataError("EV019", f"{name} cannot be used ({why}).",
-                              "Choose another output."), file=sys.stderr)
-        return EXITS["EV019"]
+        error = _unusable(e)
+        print(error, file=sys.stderr)
+        return EXITS.get(error.code, 1)
     except KeyboardInterrupt as e:
         print(str(e) or "interrupted; no half-written file is left.", file=sys.stderr)
         return INTERRUPTED
     return 0
+
+
+def _unusable(error: OSError) -> EvflowDataError:
+    """What to say of an input that may not be read, or of an output that cannot be written."""
+    name, why = error.filename, REASONS.get(error.errno or 0, error.strerror or str(error))
+    if name and os.path.exists(name) and not os.access(name, os.R_OK):
+        return EvflowDataError("EV016", f"{name} cannot be opened ({why}).",
+                               "Check its permissions.")
+    return EvflowDataError("EV019", f"{name or 'the output'} cannot be used ({why}).",
+                           "Choose another output.")
 
 
 def run() -> NoReturn:

@@ -14,6 +14,7 @@ import numpy as np
 from evflow.errors import EvflowDataError, naming
 from evflow.files.archives import load_npz
 from evflow.files.atomic import atomic_write
+from evflow.files.regular import need_opened
 from evflow.files.whole import need_members
 
 PARAMETERS = ("theta_on", "theta_off", "eta_on", "eta_off")
@@ -86,6 +87,7 @@ def _check_kind(path: Path) -> None:
         raise EvflowDataError("EV016", f"no camera file at {path}"
                               f"{' (a folder without camera.npz)' if path.is_dir() else ''}.",
                               "Make one: evflow estimate RECORDING -o cam/.")
+    need_opened(path)
     with open(path, "rb") as opened:
         head = opened.read(6)
     if head == np.lib.format.MAGIC_PREFIX:

@@ -17,6 +17,7 @@ import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.files.limits import check_expansion
+from evflow.files.regular import need_opened
 from evflow.files.spool import Spool
 
 MAX_HEADER = 10_000  # bytes, NumPy's own bound
@@ -39,10 +40,11 @@ def is_zip(path: Path) -> bool:
 
 @contextlib.contextmanager
 def unzipped(path: Path, streamed: Collection[str] = ()) -> Iterator[zipfile.ZipFile]:
-    """Open an archive; EV016 without the file, EV009 if it, or anything the block reads from it, is
-    damaged or a bomb, EV008 if an array that it reads is pickled.
+    """Open an archive; EV016 if it cannot be opened, EV009 if it, or anything the block reads from
+    it, is damaged or a bomb, EV008 if an array that it reads is pickled.
 
     streamed: members that are read in pieces and may therefore be of any size."""
+    need_opened(path)
     try:
         with zipfile.ZipFile(path) as archive:
             found, there = archive.infolist(), os.path.getsize(path)
@@ -52,8 +54,6 @@ def unzipped(path: Path, streamed: Collection[str] = ()) -> Iterator[zipfile.Zip
             sizes = [info.file_size for info in found if info.filename not in streamed]
             check_expansion(sum(sizes), there, path)
             yield archive
-    except FileNotFoundError as e:
-        raise EvflowDataError("EV016", f"no file at {path}.", where=path) from e
     except Pickled as e:
         raise EvflowDataError("EV008", f"{path} cannot be read: {e}.", "Save it as numbers.",
                               where=path) from e

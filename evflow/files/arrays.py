@@ -14,6 +14,7 @@ import numpy as np
 
 from evflow.errors import EvflowDataError
 from evflow.files.archives import npy_header
+from evflow.files.regular import need_opened
 from evflow.files.whole import need_size
 
 
@@ -21,11 +22,12 @@ def mapped(path: Path, shape: tuple[int | None, ...], *, fields: bool = False) -
     """A memory-mapped .npy of numbers; trailing axes of length 1 beyond `shape` are dropped.
     fields: expect a structured array instead.
 
-    Raises EV009 (damaged, pickled, another shape), EV016 (absent).
+    Raises EV009 (damaged, pickled, another shape), EV016 (absent, or not to be opened).
     """
     if not path.is_file():
         raise EvflowDataError("EV016", f"{path} does not exist.", "Is the folder complete?",
                               where=path)
+    need_opened(path)
     try:
         with open(path, "rb") as f:
             found, fortran, dtype = npy_header(f)

@@ -19,6 +19,16 @@ def need_regular(path: AnyPath) -> AnyPath:
     return path
 
 
+def need_opened(path: Path) -> None:
+    """Raise EV016 where a file cannot be opened, as where it may not be read."""
+    try:
+        with open(path, "rb"):
+            pass
+    except OSError as e:
+        raise EvflowDataError("EV016", f"{path} cannot be opened ({e.strerror or e}).",
+                              "Check its name and its permissions.", where=path) from e
+
+
 def is_there(path: AnyPath) -> bool:
     """Whether the file exists; EV016 as in `need_regular`, so that a pipe is not called absent."""
     return need_regular(path).is_file()

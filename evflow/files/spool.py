@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import contextlib
 import contextvars
-import errno
 import mmap
+import os
 import tempfile
 from collections.abc import Iterator
 from typing import IO, Any
@@ -18,6 +18,7 @@ from typing import IO, Any
 import numpy as np
 
 from evflow.errors import EvflowDataError
+from evflow.files.atomic import REASONS
 
 LIMIT = 1 << 29  # bytes of a column in memory: 67 million int64 times
 SOME = 1 << 25  # the same for columns of which little is used again: 4 million times
@@ -61,6 +62,19 @@ def put_aside(array: np.ndarray) -> np.ndarray:
     return aside
 
 
+@contextlib.contextmanager
+def temporary_folder() -> Iterator[None]:
+    """Raise EV019 where the system's temporary folder is full, absent or may not be used."""
+    try:
+        yield
+    except OSError as e:
+        why = REASONS.get(e.errno or 0, e.strerror or str(e))
+        raise EvflowDataError(
+            "EV019", "the recording is larger than memory, and the temporary folder "
+            f"{tempfile.tempdir or os.environ.get('TMPDIR', '')} cannot be used ({why}).",
+            "Set TMPDIR to a folder with more space, or read a part: --start, --stop.") from e
+
+
 class Spool:
     """Parts (n,) of one dtype, joined by `array`. Memory: the rows below the limit, up to an eighth
     more that is unused, and `JOINED` bytes of parts."""
@@ -77,7 +91,8 @@ class Spool:
         self._parts.append(part.astype(self.dtype, copy=part.base is not None))
         self.rows += len(part)
         if self._file is None and self.rows * self.dtype.itemsize > self.limit:
-            self._file = tempfile.TemporaryFile(prefix="evflow-")  # noqa: SIM115 (mapped later)
+            with temporary_folder():
+                self._file = tempfile.TemporaryFile(prefix="evflow-")  # noqa: SIM115 (mapped later)
             self._parts.insert(0, self._memory[: self._filled])
             self._memory = np.empty(0, self.dtype)
         if self._file is not None:
@@ -97,17 +112,13 @@ class Spool:
     def _write(self, file: IO[bytes]) -> None:
         parts, self._parts = self._parts, []
         try:
-            for part in parts:
-                file.write(np.ascontiguousarray(part).data.cast("B"))
-            file.flush()
-        except OSError as e:
+            with temporary_folder():
+                for part in parts:
+                    file.write(np.ascontiguousarray(part).data.cast("B"))
+                file.flush()
+        except EvflowDataError:
             file.close()
-            if e.errno != errno.ENOSPC:
-                raise
-            raise EvflowDataError(
-                "EV019", f"the recording is larger than memory, and its temporary folder "
-                f"{tempfile.gettempdir()} is full.",
-                "Set TMPDIR to a folder with more space, or read a part: --start, --stop.") from e
+            raise
 
     def array(self) -> np.ndarray:
         """All rows, in one array or mapped from the file. The spool is empty afterwards."""

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -300,3 +302,18 @@ def test_two_cameras_beside_each_other_with_their_errors(
     times = [(out / f"compare.{kind}").stat().st_mtime_ns for kind in ("html", "json")]
     assert times == sorted(times)  # interrupted in the page, a command can be given again
     assert page.count("sha256 ") == 2
+
+
+def test_an_input_that_may_not_be_read_is_not_called_an_output(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "camera.npz"
+    path.write_bytes(b"PK")
+
+    def refused(self: object) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr(cli.Info, "run", refused)
+    monkeypatch.setattr(cli.os, "access", lambda name, mode: False)
+    assert main(["info", str(path)]) == 1
+    assert re.search(r"EV016.*cannot be opened \(permission denied\)", capsys.readouterr().err)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 from collections.abc import Callable
@@ -16,6 +17,9 @@ from helpers.recordings import make, write_ijrr
 from evflow.camera import Camera
 from evflow.camera.perturb import read_noise_histogram
 from evflow.errors import EvflowDataError
+from evflow.files import regular
+from evflow.files.archives import load_npz
+from evflow.files.arrays import mapped
 from evflow.io import read_recording
 from evflow.io.source import open_frames
 from evflow.network.weights import load_weights
@@ -105,3 +109,18 @@ def test_what_is_read_whole_is_not_too_large(tmp_path: Path, name: str, read: An
     with pytest.raises(EvflowDataError, match=r"EV009.*has 68,719,476,736 bytes") as caught:
         read(tmp_path / name, put)
     assert str(tmp_path) in str(caught.value)
+
+
+@pytest.mark.parametrize("read", [
+    Camera.load, load_npz, lambda path: mapped(path, (None,))], ids=["camera", "npz", "npy"])
+def test_a_file_that_may_not_be_read_is_not_called_damaged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read: Callable[[Path], Any]
+) -> None:
+    def refused(path: Path, mode: str) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    path = tmp_path / "camera.npz"
+    path.write_bytes(b"PK")
+    monkeypatch.setattr(regular, "open", refused, raising=False)
+    with pytest.raises(EvflowDataError, match=r"EV016.*cannot be opened \(Permission denied\)"):
+        read(path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import mmap
 import subprocess
 import sys
@@ -173,3 +174,15 @@ def test_an_array_that_is_put_aside_is_the_same_on_the_disk() -> None:
     np.testing.assert_array_equal(aside, array)
     assert (aside.shape, aside.dtype) == (array.shape, array.dtype)
     assert isinstance(aside.base.base if aside.base.base is not None else aside.base, np.memmap)
+
+
+@pytest.mark.parametrize(("number", "why"), [(errno.EDQUOT, "quota"), (errno.ENOENT, "no such")])
+def test_a_temporary_folder_that_cannot_be_used_is_not_called_a_damaged_recording(
+    monkeypatch: pytest.MonkeyPatch, number: int, why: str
+) -> None:
+    def refused(prefix: str) -> None:
+        raise OSError(number, "refused")
+
+    monkeypatch.setattr(spool.tempfile, "TemporaryFile", refused)
+    with pytest.raises(EvflowDataError, match=rf"EV019.*{why}.*TMPDIR"):
+        Spool(np.int64, 0).append(np.arange(10))
