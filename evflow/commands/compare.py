@@ -101,7 +101,8 @@ class Compare(Reading):
         for name in ("compare.json", *(["compare.html"] if self.plots else [])):
             if self.out:
                 need_absent(self.out / name, self.overwrite)
-        need_packages(self.real, self.synthetic, pictures=bool(self.out) and self.plots)
+        need_packages(self.real, self.synthetic, pictures=bool(self.out) and self.plots,
+                      no_pictures="--no-plots")
 
     def _compared(self, *labels: str) -> dict[str, str]:
         """The facts that a page states: the two files, the command and the versions."""

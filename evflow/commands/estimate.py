@@ -122,7 +122,8 @@ class Estimate(Compiling, Reading):
 
         self._check_options()
         moving = self.protocol == "motion"
-        need_packages(self.recording, *self.more, pictures=self.plots or self.report)
+        need_packages(self.recording, *self.more, pictures=self.plots or self.report,
+                      no_pictures="--no-plots --no-report")
         early.settle()
         with staged(self.out, names=FILES, overwrite=self.overwrite) as out:
             recording, checked, doubts = self._recorded(self.recording)

@@ -40,8 +40,7 @@ def require() -> None:
         import matplotlib  # noqa: F401
     except ImportError as e:
         raise EvflowDataError("EV010", "pictures need matplotlib.",
-                              'pip install "evflow-jax[viz]", '
-                              'or pass --no-plots --no-report.') from e
+                              'pip install "evflow-jax[viz]".') from e
 
 
 def new_figure(
