@@ -112,18 +112,22 @@ class CameraEstimator:
         if piece.has_frames and not len(piece.events):
             return 0
         piece = self._as_bright(piece)
-        stale_us, self._stale_us = self._stale_us, ends_stale(piece)
-        if stale_us is not None and piece.has_frames and piece.frame_times[0] == stale_us:
+        white, stale_us = piece.full_scale, ends_stale(piece)
+        if piece.has_frames and piece.frame_times[0] == self._stale_us:
             piece = dataclasses.replace(
                 piece, frames=piece.frames[1:], frame_times=piece.frame_times[1:])
             if len(piece.frames) == 1:
+                self._stale_us = stale_us
                 return 0
         piece, given = dense.thinned(without_repeats(piece)), piece.notes
-        told = {note.code for note in self._notes}
-        self._notes += tuple(n for n in piece.notes[len(given):] if n.code not in told)
-        plan = plan_windows(piece, self._min_us)
+        plan = plan_windows(piece, self._min_us)  # refuses pieces, of which nothing is kept
+        self._stale_us = stale_us
+        if piece.frames.dtype == np.uint16:
+            self._white = white
         skipped = tuple(s.moved(self._frames) for s in plan.skipped)
         self._frames += len(piece.frames) - 1
+        told = {note.code for note in self._notes}
+        self._notes += tuple(n for n in piece.notes[len(given):] if n.code not in told)
         self._notes = tuple(dict.fromkeys((*self._notes, *condensed(skipped))))[:self.NOTES]
         stretches = cut(piece, plan, path=self._refine == "auto", first=self._size is None)
         self._size = piece.events.size
@@ -176,7 +180,6 @@ class CameraEstimator:
                 "EV003", f"a piece whose frames are on 0..{piece.full_scale}, after pieces on "
                 f"0..{white}.", "A piece shows only how bright its own frames are: give all of "
                 f"them the camera's white, Recording(..., full_scale={piece.full_scale}).")
-        self._white = white
         return dataclasses.replace(piece, full_scale=white)
 
     def _again(self, state: State) -> State:

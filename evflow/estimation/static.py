@@ -25,6 +25,7 @@ from evflow.notes import Note, why_no_frames
 from evflow.recordings.faulty_pixels import dead_pixels, hot_at_rest
 from evflow.recordings.gaps import joined, stretches
 from evflow.recordings.stillness import unlike_noise
+from evflow.recordings.windows import check_overlap, covered_us
 from evflow.training.config import PRESETS
 from evflow.types import Events, Recording
 
@@ -43,7 +44,8 @@ def estimate_noise(
     `noise_over_light` joins. Leak is identified by its intervals, shot noise if frames show the
     light. alone: noise is what was asked for, not what is left without frames. Gaps in the events,
     as of lost packets, are not counted as time of observation. Raises EV017 (EV011 unless `alone`)
-    if the scene moves, or the recording is too short to decide.
+    if the scene moves, or the recording is too short to decide; EV012 if frames lie elsewhere in
+    time.
     """
     parts = _observed(recording.events)
     events = joined(parts)
@@ -51,6 +53,8 @@ def estimate_noise(
     total = counts.sum(0, dtype=np.uint32)
     hot, dead = hot_at_rest(total), dead_pixels(total)
     _require_static(recording, events, hot, alone)
+    if len(recording.frame_times) > 1:
+        check_overlap(recording)
     seconds = events.duration_us * 1e-6
     rates, errors, means, mean_errors = zip(
         *(_rates(n, hot, dead, seconds) for n in counts), strict=True)
@@ -96,7 +100,7 @@ def _kinds(
     every pixel's wait."""
     begins = [int(part.t[0]) for part in parts]
     if recording.has_frames:
-        begins[0] = min(begins[0], int(recording.frame_times[0]))
+        begins[0] = min(begins[0], max(int(recording.frame_times[0]), covered_us(recording)[0]))
     waits = [waits_at_rest(part, faulty, (begin, int(part.t[-1])))
              for part, begin in zip(parts, begins, strict=True)]
     leak = measured_leak(sum(waits[1:], waits[0]))

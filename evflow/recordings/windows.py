@@ -76,7 +76,7 @@ def plan_windows(recording: Recording, min_us: int = MIN_US) -> WindowPlan:
     need(recording, Recording, "recording", "For a path: evflow.read_recording(path).")
     check_overlap(recording)
     times = recording.frame_times
-    start, stop = _covered(recording)
+    start, stop = covered_us(recording)
     obstacles = _obstacles(recording, start, stop)
     pairs: list[tuple[int, int]] = []
     skipped: list[Skipped] = []
@@ -224,7 +224,7 @@ def window_at(recording: Recording, pair: tuple[int, int], index: int) -> Window
     return Window(recording.events.slice(t0, t1), frame0, frame1, t0, t1, index)
 
 
-def _covered(recording: Recording) -> tuple[int, int]:
+def covered_us(recording: Recording) -> tuple[int, int]:
     """The time range of the events, widened by `EDGE_US` or a few local intervals between events: a
     slow scene has its first event some time after the camera started."""
     t = recording.events.t
@@ -244,7 +244,7 @@ def check_overlap(recording: Recording) -> None:
             "EV011", f"the recording has {len(times)} frames{why_no_frames(recording.notes)}; a "
             "window lies between two.",
             "Thresholds are measured against intensity: record or add frames.")
-    start, stop = _covered(recording)
+    start, stop = covered_us(recording)
     if times[-1] <= start or times[0] >= stop:
         large = too_large(times, t)
         raise EvflowDataError(

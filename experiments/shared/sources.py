@@ -130,8 +130,9 @@ def together(key: jax.Array) -> Source:
     sensor = SENSORS["noisy"]
     nominal = Summary(*(jnp.float32(v) for v in (
         sensor.theta, sensor.theta, 0.0, 0.0, sensor.mismatch, sensor.mismatch)))
-    camera = with_faults(key, sample_pixels(key, nominal, SHAPE), 0.01, dead=0.01)
-    rates = still(key, camera, sensor.model, 5.0).count_map().sum(0) / 5.0
+    for_pixels, for_faults, for_events = jax.random.split(key, 3)
+    camera = with_faults(for_faults, sample_pixels(for_pixels, nominal, SHAPE), 0.01, dead=0.01)
+    rates = still(for_events, camera, sensor.model, 5.0).count_map().sum(0) / 5.0
     x = np.geomspace(0.5, 150, 30)
     on, off = (np.asarray(sensor.theta / t) for t in (camera.theta_on, camera.theta_off))
     hz = 2.5 * laws.dimmed(60.0) * (on + off) + np.asarray(

@@ -251,3 +251,19 @@ def test_what_is_kept_does_not_grow() -> None:
     assert less.chunks == (0, 2, 4, 6)
     assert less.read == tuple(range(0, 32, 2))
     assert thinned(state, 9, 33).chunks == state.chunks
+
+
+def test_a_refused_piece_leaves_no_trace() -> None:
+    """A piece on another clock, darker than the ones to come, that ends with a repeated frame."""
+    recording, _ = hidden(3)
+    deep = dataclasses.replace(recording, frames=recording.frames.astype(np.uint16) * 16)
+    frames = deep.frames // 8
+    frames[-1] = frames[-2]
+    elsewhere = dataclasses.replace(
+        deep, frames=frames, full_scale=0, frame_times=deep.frame_times + 10**12)
+    whole, estimator = CameraEstimator(), CameraEstimator()
+    with pytest.raises(EvflowDataError, match="EV012"):
+        estimator.add(elsewhere)
+    assert estimator.add(deep) == whole.add(deep)
+    for a, b in zip(*(numbers(e.estimate()) for e in (whole, estimator)), strict=True):
+        np.testing.assert_array_equal(a, b)

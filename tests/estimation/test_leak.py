@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from evflow import Camera, Events, Recording, SensorModel, simulate
+from evflow.errors import EvflowDataError
 from evflow.estimation.intervals import EDGES, QuietWaits, life_table, waits_at_rest
 from evflow.estimation.leak import measured_leak
 from evflow.estimation.pixel_noise import calm, quiet_time
@@ -192,3 +193,15 @@ def test_noise_of_bright_places_is_that_of_the_mean_light_once_it_falls(leak_hz:
     certain, _ = at_mean_light(own, 1e-4 * own, histogram, leak_hz, float(
         histogram[0, 2].sum() / histogram[0, 1].sum()), 0.02)
     assert certain[0] == pytest.approx(own[0], rel=1e-3)  # as bright as all: nothing changes
+
+
+def test_frames_that_begin_long_before_the_events_are_no_time_at_rest() -> None:
+    sensor = SensorModel(leak_hz=0.3, leak_jitter=0.1, shot_hz=0.5, noise_resets_memory=True)
+    frame = np.full(SHAPE, 100, np.uint8)
+    frames, times = np.repeat(frame[None], 41, 0), 250_000 * np.arange(41)
+    events = simulate(jax.random.key(0), frames, times, Camera.constant(SHAPE), model=sensor)
+    found, early = (estimate_noise(Recording(events, frames, begin)) for begin in (
+        times, np.concatenate([[-10_000_000], times[1:]])))
+    assert early.sensor.leak_hz == pytest.approx(found.sensor.leak_hz, rel=0.01)
+    with pytest.raises(EvflowDataError, match="EV012"):
+        estimate_noise(Recording(events, frames, times + 1_700_000_000_000_000))
