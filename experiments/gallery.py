@@ -31,6 +31,7 @@ def main(options: Options) -> None:
         raise EvflowDataError("EV020", f"no pictures {sorted(unknown)}.",
                               f"Choose from {', '.join(PICTURES)}.")
     need_writable(options.out)
+    options.out.mkdir(parents=True, exist_ok=True)
     scenes = Scenes(options.seed)
     for name, draw in PICTURES.items():
         if not options.only or name in options.only:

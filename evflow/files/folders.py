@@ -93,6 +93,12 @@ def staged(folder: str | os.PathLike, *, names: Sequence[str], overwrite: bool =
                     folder.rmdir()
 
 
+def need_writable(folder: Path) -> None:
+    """Raise EV019 where no file can be written into a folder, and EV013 where it is a file."""
+    with staged(folder, names=()):
+        pass
+
+
 @contextlib.contextmanager
 def _alone(folder: Path) -> Iterator[None]:
     """Hold the lock of a folder, which other processes wait for: files of two of them would mix.

@@ -120,11 +120,7 @@ def begin(options: Any, name: str) -> None:
                    if type(value := getattr(options, field.name)) is int and field.name != "seed"})
     at_least(0, seed=getattr(options, "seed", None))
     path = options.out / f"{name}.json"
-    new = not options.out.exists()
     need_writable(options.out)
-    if new:  # nothing is left of what is refused later
-        with contextlib.suppress(OSError):
-            options.out.rmdir()
     if not path.is_file():
         return
     before = saved(path, "config")

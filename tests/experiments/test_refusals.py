@@ -230,12 +230,13 @@ def test_a_file_that_is_no_result_is_named(text: str, tmp_path: Path) -> None:
 
 def test_results_that_cannot_be_written_are_refused_before_the_work(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("kept")
-    for out in (tmp_path / "file", tmp_path / "file/results"):
-        with pytest.raises(EvflowDataError, match=r"EV019.*its folder is a file"):
-            template.main(template.Options(out=out))
     with pytest.raises(EvflowDataError, match=r"EV019.*its folder is a file"):
+        template.main(template.Options(out=tmp_path / "file/results"))
+    with pytest.raises(EvflowDataError, match=r"EV013.*file is a file"):
+        template.main(template.Options(out=tmp_path / "file"))
+    with pytest.raises(EvflowDataError, match=r"EV013.*file is a file"):
         gallery.main(gallery.Options(out=tmp_path / "file"))
-    with pytest.raises(EvflowDataError, match=r"EV019.*its folder is a file"):
+    with pytest.raises(EvflowDataError, match=r"EV013.*file is a file"):
         benchmarks.main(benchmarks.Options(out=tmp_path / "file/times.jsonl"))
     assert (tmp_path / "file").read_text() == "kept"
 
