@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from functools import partial
 from typing import Any
 
@@ -22,16 +23,14 @@ FOLDS = 5
 JITTER, DEGREES = 0.5, 8.0  # in standard deviations; of Student's t
 NETWORKS = 4  # of other initial values; single ones differ by .9 % in theta (median)
 HIDDEN = 0.15  # share of cameras found ideal that count as not searched, as with pixel="ideal"
+RATE, RATE_CONTINUED = 3e-3, 3e-4  # the latter in few steps: what was learnt is only adjusted
 
 
-def fit(rows: Rows, steps: int, seed: int) -> dict[str, Any]:
-    """The fusion's parameters from rows, in so many steps."""
+def fit(rows: Rows, steps: int, seed: int, start: dict[str, Any] | None = None) -> dict[str, Any]:
+    """The fusion's parameters from rows, in so many steps, from `start` (a fusion) or anew."""
+    scaling = scaling_of(rows["features"], start)
+    fusion = {k: jnp.asarray(v, jnp.float32) for k, v in scaling.items()}
     x = rows["features"]
-    edges = np.quantile(x, [0.003, 0.997], 0)
-    fusion: dict[str, Any] = {
-        "mean": x.mean(0), "scale": x.std(0) + 0.05, "low": edges[0], "high": edges[1],
-        "widen": np.ones(6)}
-    fusion = {k: jnp.asarray(v, jnp.float32) for k, v in fusion.items()}
     data = {k: jnp.asarray(rows[k], jnp.float32) for k in ("features", "y", "true")}
 
     searched = x.shape[1] - len(NAMES)
@@ -51,7 +50,8 @@ def fit(rows: Rows, steps: int, seed: int) -> dict[str, Any]:
         heavy = 0.5 * (DEGREES + 1) * jnp.log1p(error**2 / DEGREES)
         return (jnp.log(std) + heavy).mean()
 
-    tx = optax.adamw(optax.cosine_decay_schedule(3e-3, steps), weight_decay=1.0)
+    rate = RATE_CONTINUED if start else RATE
+    tx = optax.adamw(optax.cosine_decay_schedule(rate, steps), weight_decay=1.0)
 
     def step(carry: tuple[Any, Any], key: Array) -> tuple[tuple[Any, Any], None]:
         net, state = carry
@@ -59,14 +59,27 @@ def fit(rows: Rows, steps: int, seed: int) -> dict[str, Any]:
         return (optax.apply_updates(net, updates), state), None
 
     @jax.jit
-    def fitted(key: Array) -> Any:
-        k_init, k_steps = jax.random.split(key)
-        net = FusionNet().init(k_init, data["features"][0])["params"]
-        (net, _), _ = jax.lax.scan(step, (net, tx.init(net)), jax.random.split(k_steps, steps))
+    def fitted(net: Any, key: Array) -> Any:
+        (net, _), _ = jax.lax.scan(step, (net, tx.init(net)), jax.random.split(key, steps))
         return net
 
-    nets = [fitted(key) for key in jax.random.split(jax.random.key(seed), NETWORKS)]
+    nets = []
+    for i, key in enumerate(jax.random.split(jax.random.key(seed), NETWORKS)):
+        k_init, k_steps = jax.random.split(key)
+        first = (jax.tree.map(operator.itemgetter(i), start["net"]) if start
+                 else FusionNet().init(k_init, data["features"][0])["params"])
+        nets.append(fitted(first, k_steps))
     return {**fusion, "net": jax.tree.map(lambda *leaves: jnp.stack(leaves), *nets)}
+
+
+def scaling_of(features: np.ndarray, start: dict[str, Any] | None) -> dict[str, Any]:
+    """How a fusion scales and clips features (N, F): as `start` does, whose range is extended."""
+    low, high = np.quantile(features, [0.003, 0.997], 0)
+    if start is None:
+        return {"mean": features.mean(0), "scale": features.std(0) + 0.05, "low": low,
+                "high": high, "widen": np.ones(6)}
+    return {"mean": start["mean"], "scale": start["scale"], "low": np.minimum(start["low"], low),
+            "high": np.maximum(start["high"], high), "widen": np.ones(6)}
 
 
 def predict(fusion: dict[str, Any], features: Array, y: Array) -> tuple[Array, Array]:
@@ -74,12 +87,14 @@ def predict(fusion: dict[str, Any], features: Array, y: Array) -> tuple[Array, A
     return jax.vmap(partial(fused, fusion))(features, y)
 
 
-def cross_validated(rows: Rows, steps: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def cross_validated(
+    rows: Rows, steps: int, seed: int, start: dict[str, Any] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """y and std (N, 6) of every recording by a fusion that has not seen it."""
     y, std = np.zeros_like(rows["y"]), np.zeros_like(rows["y"])
     fold = np.arange(len(y)) % FOLDS
     for f in range(FOLDS):
-        fusion = fit({k: v[fold != f] for k, v in rows.items()}, steps, seed)
+        fusion = fit({k: v[fold != f] for k, v in rows.items()}, steps, seed, start)
         y[fold == f], std[fold == f] = predict(
             fusion, jnp.asarray(rows["features"][fold == f]), jnp.asarray(rows["y"][fold == f]))
     return y, std

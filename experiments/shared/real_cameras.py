@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -83,17 +83,15 @@ def shot_rates(hidden: Hidden, protocol: Protocol) -> np.ndarray:
 
 def draw_real(rng: np.random.Generator) -> Protocol:
     """A camera of the mixture: a quarter are ideal, the others have random imperfections."""
-    mismatch = float(np.exp(rng.uniform(np.log(0.02), np.log(0.15))))
     protocol = dataclasses.replace(
-        BASE, prior=CameraPrior(theta=(0.1, 0.5), mismatch=(mismatch, mismatch)),
-        frame_ms=int(rng.choice((20, 25, 33, 40))), intervals=int(rng.choice((8, 16, 24))),
-        shape=(96, 128), frame_noise_dn=0.5)
+        BASE, prior=_prior(rng), shape=(96, 128), frame_noise_dn=0.5,
+        frame_ms=int(rng.choice((20, 25, 33, 40))), intervals=int(rng.choice((8, 16, 24))))
     if rng.random() < 0.25:
         return protocol
 
     def some(share: float, low: float, high: float) -> float:
         """0, or log-uniform."""
-        drawn = float(np.exp(rng.uniform(np.log(low), np.log(high))))
+        drawn = _between(rng, low, high)
         return drawn if rng.random() < share else 0.0
 
     sensor = SensorModel(
@@ -109,10 +107,52 @@ def draw_real(rng: np.random.Generator) -> Protocol:
         black_dn=black if rng.random() < 0.5 else 0.0)
 
 
+def draw_single(rng: np.random.Generator) -> Protocol:
+    """A camera of one imperfection, or of none, seen for .5 or 1 s."""
+    even = rng.random() < 0.3
+    protocol = dataclasses.replace(
+        BASE, prior=_prior(rng), intervals=int(rng.choice((12, 24))))
+    cutoff_hz, dead_s = _between(rng, 25.0, 400.0), _between(rng, 1e-3, 5e-3)
+    noise = SensorModel(shot_hz=_between(rng, 0.3, 6.0), leak_hz=_between(rng, 0.03, 0.3),
+                        noise_resets_memory=True)
+    exposure_ms = int(rng.integers(5, 25))
+    changes: list[tuple[int, dict[str, Any]]] = [  # and how often
+        (4, {}),
+        (4, {"black_dn": float(rng.uniform(-12.0, 20.0))}),
+        (2, {"dark_dn": _between(rng, 3.0, 40.0)}),
+        (3, {"model": SensorModel(cutoff_hz=cutoff_hz * (0.4 if even else 1.0),
+                                  cutoff_by_light=not even, noise_resets_memory=True)}),
+        (2, {"exposure_ms": exposure_ms}),
+        (1, {"exposure_ms": exposure_ms, "exposure_known": True}),
+        (2, {"frame_noise_dn": _between(rng, 0.8, 3.5)}),
+        (1, CHANGES["ESIM's logarithm"]),
+        (1, {"model": SensorModel(refractory_s=dead_s)}),
+        (2, {"model": noise}),
+        (1, CHANGES["v2e's noisy"]),
+        (1, CHANGES["DVS-Voltmeter's DVS346"]),
+    ]
+    often = np.array([weight for weight, _ in changes]) / sum(weight for weight, _ in changes)
+    return dataclasses.replace(protocol, **changes[rng.choice(len(changes), p=often)][1])
+
+
+def _between(rng: np.random.Generator, low: float, high: float) -> float:
+    """Log-uniform."""
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def _prior(rng: np.random.Generator) -> CameraPrior:
+    """Of one camera. Noise that always followed the thresholds (Eq. 12) would tell them."""
+    mismatch = _between(rng, 0.005, 0.15)
+    kinds: tuple[Literal["eq12", "independent", "none"], ...] = ("eq12", "independent", "none")
+    noise = kinds[rng.choice(3, p=(0.25, 0.65, 0.1))]
+    return CameraPrior(theta=(0.1, 0.5), mismatch=(mismatch, mismatch), noise=noise,
+                       eta=(0.003, 3.0))
+
+
 def draw_exposed(rng: np.random.Generator) -> Protocol:
     """One of `draw_real` whose frames are exposed for a time that the recording tells."""
     protocol = draw_real(rng)
-    exposure_ms = round(float(np.exp(rng.uniform(np.log(2.0), np.log(30.0)))))
+    exposure_ms = round(_between(rng, 2.0, 30.0))
     return dataclasses.replace(
         protocol, exposure_ms=min(exposure_ms, protocol.frame_ms), exposure_known=True)
 

@@ -47,7 +47,6 @@ LONGEST_STEP = 0.5  # log theta per pass
 MODEL_ERROR = 0.04  # of a balance residual, by interpolation; counts add their own
 EMPTY = 0.3  # balance weight below which a residual is negligible
 FRESH_ODDS = 2.0  # log odds required for a fresh start: few recordings have one
-RATES = np.array([False, False, True, True, False, False])  # which values of a summary are
 THETA_ERROR = 0.05  # relative error of the stepped thresholds, where noise follows from them
 
 
@@ -158,9 +157,8 @@ class Fit:
         moved = self.values[which] * np.exp(np.clip(change, -LONGEST_STEP, LONGEST_STEP))
         self.values[which] = np.clip(moved, 0.02, 2.0)
 
-    def features(self) -> tuple[np.ndarray, np.ndarray]:
-        """The fusion's features (F,) at the current values, float32, and which are of noise
-        rates."""
+    def features(self) -> np.ndarray:
+        """The fusion's features (F,) at the current values."""
         made = jax.tree.map(lambda a: a[0], self.simulate(self.values[None]))
         seen, theta = self.recorded, self.values[:2]
 
@@ -172,24 +170,19 @@ class Fit:
         motion = np.concatenate([c.motion_px for c in self.chunks])
         light = np.mean([c.path[0].mean() for c in self.chunks])
         pixels = max(float(seen.pixels), 1.0)
-        parts: list[tuple[Any, Any]] = [
-            (np.log(self.values[:4] / self.prior[:4]), RATES[:4]),
-            (np.log(self.prior_std), RATES), (np.log(self.values[:4]), RATES[:4]),
-            *((part, False) for part in (
-                np.log(self.values[4:] + 0.01), residual, ratio("roots"), ratio("active"),
-                ratio("events"), ratio("early"),
-                np.log(square_residual(seen, theta) / square_residual(made, theta)),
-                np.log(size[[0, -1]] + EMPTY), np.log(seen.events + 1.0),
-                np.log((seen.active + 1.0) / pixels))),
-            *((part, True) for part in self.noise_features()),
-            (np.log([float(seen.exposure) + 1.0, pixels]), False),
-            ([np.log(motion.mean() + 0.1), np.log(motion.max() + 0.1), light, self.start == FRESH,
-              np.log(np.mean([c.dt_s.mean() for c in self.chunks]) / 0.025)], False),
+        parts = [
+            np.log(self.values[:4] / self.prior[:4]), np.log(self.prior_std),
+            np.log(self.values[:4]), np.log(self.values[4:] + 0.01), residual.ravel(),
+            ratio("roots"), ratio("active"), ratio("events"), [ratio("early")],
+            np.log(square_residual(seen, theta) / square_residual(made, theta)),
+            np.log(size[[0, -1]] + EMPTY).ravel(), np.log(seen.events + 1.0),
+            np.log((seen.active + 1.0) / pixels), *self.noise_features(),
+            np.log([float(seen.exposure) + 1.0, pixels]),
+            [np.log(motion.mean() + 0.1), np.log(motion.max() + 0.1), light, self.start == FRESH,
+             np.log(np.mean([c.dt_s.mean() for c in self.chunks]) / 0.025)],
         ]
-        arrays = [np.asarray(part, np.float64) for part, _ in parts]
-        marks = [np.broadcast_to(of, a.shape) for a, (_, of) in zip(arrays, parts, strict=True)]
-        return (np.concatenate([a.ravel() for a in arrays]).astype(np.float32),
-                np.concatenate([m.ravel() for m in marks]))
+        return np.concatenate([np.asarray(p, np.float64).ravel() for p in parts]).astype(
+            np.float32)
 
     def noise_features(self) -> list[np.ndarray]:
         """Rates of the strata against their combination, and agreement with Eq. 12."""
@@ -241,9 +234,8 @@ def refine_summary(
     fit.choose_start()
     for offset in OFFSETS:
         fit.step(offset)
-    signs = path_signs(found, noise_dn, blur_s, fit.values[:2]).astype(np.float32)
-    seen, of_noise = fit.features()
-    features = np.concatenate([seen, signs])
+    signs = path_signs(found, noise_dn, blur_s, fit.values[:2])
+    features = np.concatenate([fit.features(), signs.astype(np.float32)])
     stepped = Summary(*(jnp.float32(v) for v in fit.values))
     if fusion is None:
         return Refined(stepped, std, stepped, features, fit.start == FRESH)
@@ -252,8 +244,7 @@ def refine_summary(
             "EV018", f"the weights' fusion sees {fusion['mean'].size} features of a recording, "
             f"this version has {features.size}.",
             'They are of another version: pass refine="off", or refit: python -m experiments.fuse.')
-    of_noise = np.concatenate([of_noise, np.zeros(len(signs), bool)])
-    result, result_std = squashed_summary(*corrected(fusion, features, of_noise, stepped))
+    result, result_std = squashed_summary(*corrected(fusion, features, stepped))
     result, result_std = _with_noise(chunks, result, result_std, signal, fit.factor)
     return Refined(result, result_std, stepped, features, fit.start == FRESH)
 

@@ -22,9 +22,6 @@ Array = jax.Array
 # Relative increase of the variance for each feature outside of training's range; measured on
 # recordings of up to 8 s.
 VARIANCE_PER_OUTLIER_FEATURE = 0.04
-# Hz, the lowest noise rate of training's cameras, of most of which the noise follows the thresholds
-# (Eq. 12): in quieter ones it would be taken for high thresholds.
-LEAST_NOISE_HZ = 0.02
 
 
 class FusionNet(nn.Module):
@@ -42,27 +39,10 @@ class FusionNet(nn.Module):
 
 @jax.jit
 def corrected(
-    fusion: dict[str, Any], features: Array, of_noise: Array, stepped: Summary
+    fusion: dict[str, Any], features: Array, stepped: Summary
 ) -> tuple[Array, Array]:
-    """The stepped summary, corrected by the fusion.
-
-    Args:
-        fusion: as of `refine_summary`.
-        features: (F,).
-        of_noise: (F,) bool, features of the noise rates. Where a rate is below LEAST_NOISE_HZ, they
-            count as training's mean for all but the rates.
-        stepped: the summary after the steps.
-
-    Returns:
-        y (6,) and its std (6,).
-    """
-    y = unsquash_summary(stepped)
-    quiet = jnp.minimum(stepped.eta_on, stepped.eta_off) < LEAST_NOISE_HZ
-    kept = ~quiet | (jnp.arange(6) // 2 == 1)
-    both = zip(fused(fusion, features, y),
-               fused(fusion, jnp.where(of_noise, fusion["mean"], features), y), strict=True)
-    result, std = (jnp.where(kept, seen, unseen) for seen, unseen in both)
-    return result, std
+    """y (6,) of the stepped summary, corrected by the fusion, and its std."""
+    return fused(fusion, features, unsquash_summary(stepped))
 
 
 def fused(fusion: dict[str, Any], features: Array, y: Array) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""The steps and what they leave: thresholds from a wrong start, and the fusion's features."""
+"""The Gauss-Newton steps: thresholds from a wrong start."""
 
 from __future__ import annotations
 
@@ -12,28 +12,7 @@ from helpers.networks import hidden
 
 from evflow.camera import Summary
 from evflow.estimation.refine import refine_summary, refinement_chunks
-from evflow.estimation.refine.fit import Fit
 from evflow.recordings import plan_windows
-
-
-def test_features_of_noise_are_those_that_change_with_its_rates(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    recording, _ = hidden(3)
-    start = Summary(*map(jnp.float32, (0.2, 0.3, 0.1, 0.2, 0.03, 0.03)))
-    chunks = refinement_chunks(recording, plan_windows(recording).pairs)
-    made = Fit(chunks, start, start, 0)
-    before, of_noise = made.features()
-    monkeypatch.setattr(made, "simulate",
-                        lambda _: jax.tree.map(lambda a: a[None], made.recorded))
-    same, _ = made.features()
-    made.values[2:4] *= 2.0
-    made.prior_std[2:4] *= 1.5
-    made.quiet = 3 * made.quiet
-    changed = made.features()[0] != same
-    assert len(before) == len(of_noise)
-    assert of_noise[changed].all()
-    assert changed.sum() > 0.8 * of_noise.sum()
 
 
 @pytest.mark.slow

@@ -7,12 +7,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
-from evflow.camera import Summary
 from evflow.estimation.refine import fused
-from evflow.estimation.refine.fusion import LEAST_NOISE_HZ, FusionNet, corrected
-from evflow.network.coordinates import unsquash_summary
+from evflow.estimation.refine.fusion import FusionNet
 
 
 def small_fusion(*added: float) -> dict[str, Any]:
@@ -39,19 +36,3 @@ def test_fusion_holds_features_inside_what_it_knows_and_is_less_sure() -> None:
     np.testing.assert_array_equal(inside, beyond)
     _, widest = fused(fusion, features.at[-1].set(9.0).at[0].set(-9.0), y)
     assert bool((std > 0).all() & (std < wider).all() & (wider < widest).all())
-
-
-@pytest.mark.parametrize("eta_off", [0.5 * LEAST_NOISE_HZ, 2.0 * LEAST_NOISE_HZ])
-def test_noise_rates_below_trainings_tell_nothing_of_thresholds(eta_off: float) -> None:
-    """An ideal camera without noise seemed to have thresholds 6 and 8 % too high."""
-    stepped = Summary(*map(jnp.float32, (0.2, 0.3, 0.4, eta_off, 0.03, 0.03)))
-    features, of_noise = jnp.linspace(-1.0, 1.0, 5), jnp.arange(5) >= 3
-    fusion = {**small_fusion(0.1), "mean": jnp.full(5, 0.3)}
-    seen, unseen = (fused(fusion, f, unsquash_summary(stepped))
-                    for f in (features, jnp.where(of_noise, 0.3, features)))
-    assert not np.isclose(seen[0], unseen[0]).any()
-    y, std = corrected(fusion, features, of_noise, stepped)
-    others = unseen if eta_off < LEAST_NOISE_HZ else seen
-    for got, rates, rest in zip((y, std), seen, others, strict=True):
-        np.testing.assert_allclose(got[2:4], rates[2:4], rtol=1e-5)
-        np.testing.assert_allclose(np.delete(got, [2, 3]), np.delete(rest, [2, 3]), rtol=1e-5)
