@@ -101,7 +101,7 @@ def receptor_notes(
             "frames.offset", "how much more light the pixels see than the frames show is hardly "
             f"determined ({optics.offset_dn:.0f} ± {optics.offset_dn_std:.0f} DN), and by itself "
             f"changes the thresholds by {due:.0%}. Their errors count on most cameras having no "
-            "such light; two real DAVIS had 18 and 25 DN. A longer recording, with dark and bright "
+            "such light; two real DAVIS had 18 and 24 DN. A longer recording, with dark and bright "
             "areas, determines it."))
     return notes
 
