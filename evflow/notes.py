@@ -92,7 +92,7 @@ NOTES: dict[str, str] = {
     "pixels.dead": "pixels never fire",
     "pixels.fast": "the photoreceptor's cutoff is too high to be measured",
     "pixels.hot": "pixels fire without a signal",
-    "pixels.log": "the pixels' response is logarithmic in dark light too",
+    "pixels.log": "the pixels' response is logarithmic in dim light too",
     "pixels.lost": "pixels lose contrast in their dead time",
     "pixels.slow": "the photoreceptor's low-pass was measured",
     "pixels.unsure": "most pixels have no events of their own",

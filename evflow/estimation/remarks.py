@@ -18,7 +18,7 @@ UNDETERMINED = 2.0  # times the stated error of theta: what the light alone may 
 FEW_EVENTS = 200  # of a polarity: with fewer its threshold is called uncertain
 
 LOGARITHMIC = Note(
-    "pixels.log", "the pixels' response is logarithmic in dark light too, as ESIM's (log_eps), not "
+    "pixels.log", "the pixels' response is logarithmic in dim light too, as ESIM's (log_eps), not "
     "linear below 20 DN as v2e's (linlog): the thresholds are of that.")
 
 

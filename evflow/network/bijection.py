@@ -147,7 +147,7 @@ def seen_code(code: Code, sensor: SensorModel | None, optics: Optics | None) -> 
     if not traced and not np.asarray(code.context)[..., 2].any():
         raise EvflowDataError(
             "EV020", "a slow pixel, one that sees additional light, or one that is logarithmic in "
-            "dark light too, but no intensity.", "What it sees depends on the light: pass "
+            "dim light too, but no intensity.", "What it sees depends on the light: pass "
             "intensity to code_from_video, the mean lin-log of the frames.")
     rise, fall = jnp.split(code.changes, 2, -1)
     changes, intensity = seen_changes(seen_by, rise - fall, intensity, window_s)

@@ -266,7 +266,7 @@ def _assumptions(
         "Alignment": "Frames and events on one clock; frame times taken as mid-exposure.",
         "Response": f"Frames taken as linear in light, {recording.frames.dtype} with white at "
                     f"{recording.full_scale}; logarithm " + (
-                        "in dark light too, as in ESIM." if found.sensor.log_map == "log_eps"
+                        "in dim light too, as in ESIM." if found.sensor.log_map == "log_eps"
                         else "as in v2e, linear below 20 of 255."),
         "Read": " ".join(
             f"{text[0].upper()}{text[1:].rstrip('.')}." for text in texts(recording.notes)) or "–",

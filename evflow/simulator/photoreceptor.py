@@ -7,7 +7,7 @@ and a small error of its time stamp. With light L in DN of the frames, the pixel
 
 (first order, with a rate proportional to light as in v2e; or r = 1 / tau at any light, where a
 later stage is slower than the photoreceptor), `delay` after the frames' clock. The logarithm is
-v2e's lin-log, or ESIM's, which is one in dark light too. u is linear between
+v2e's lin-log, or ESIM's, which is one in dim light too. u is linear between
 the given times, which is solved exactly for steps of any length. `SensorModel.cutoff_hz` is v2e's
 discretisation, valid for steps far below tau. tau = 1 / (2 pi cutoff).
 """
@@ -59,7 +59,7 @@ class Photoreceptor:
 
     @property
     def logarithmic(self) -> bool:
-        """Whether the logarithm is one in dark light too."""
+        """Whether the logarithm is one in dim light too."""
         return self.log_map == "log_eps"
 
     @property

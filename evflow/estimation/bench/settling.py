@@ -1,6 +1,6 @@
 """How long pixels go on sending a step's events after the light rests again.
 
-20 ms are enough for fast pixels. Slow ones, in dark light above all, take longer: until then the
+20 ms are enough for fast pixels. Slow ones, in dim light above all, take longer: until then the
 first part of a rest is busier than its last third, which is noise.
 """
 

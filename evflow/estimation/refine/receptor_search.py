@@ -86,7 +86,7 @@ def find(data: Sample) -> Found | None:
 
 def _with_map(data: Sample) -> tuple[Regression, np.ndarray, float] | None:
     """The more probable log map, its most probable constants, and the effective number of events;
-    None where no threshold follows from them. The maps differ in dark light alone. Each divides the
+    None where no threshold follows from them. The maps differ in dim light alone. Each divides the
     events at noise in its own way, and another one must be the better with both: what is divided
     more finely is explained better by any map."""
     begun = _begin(data, "linlog")
