@@ -173,7 +173,9 @@ class Hints:
     def _microseconds(self, t: np.ndarray, native: str) -> np.ndarray:
         unit = native if self.time_unit == "auto" else self.time_unit
         if t.dtype.kind in "mM" and not np.isnat(t).any():  # they know their unit
-            t, unit = t.astype(f"{t.dtype.kind}8[us]").astype(np.int64), "us"
+            exact = np.datetime_data(t.dtype)[0] in ("ns", "ps", "fs", "as")
+            unit = "ns" if exact else "us"  # to be rounded below, which a cast does not
+            t = t.astype(f"{t.dtype.kind}8[{unit}]").astype(np.int64)
         if t.dtype.kind == "f":
             if self.time_unit == "auto":
                 check_whole(t, native)

@@ -296,3 +296,26 @@ def test_reading_imports_neither_jax_nor_optional_packages(sources: dict[str, Pa
 def test_the_typed_hints_are_those_that_readers_know() -> None:
     fields, told = typing.get_type_hints(Hints), typing.get_type_hints(HintArguments)
     assert told == {f.name: fields[f.name] for f in dataclasses.fields(Hints) if f.init}
+
+
+@pytest.mark.parametrize("format", ["dsec", "npz"])
+def test_a_range_counts_from_the_first_event_even_if_that_is_dropped(
+    tmp_path: Path, format: str
+) -> None:
+    """Events outside of the sensor, that fill the first part that is read."""
+    rng, t = np.random.default_rng(0), 1_000_000 + np.arange(20_000) * 200
+    x, y = rng.integers(0, 60, 20_000), rng.integers(0, 48, 20_000)
+    x[0] = 63
+    events = Events(x, y, t, rng.random(20_000) < 0.5, (64, 48))
+    write_events(tmp_path / "a", events, format)
+    found = read_events(tmp_path / "a", size=(60, 48), drop_outside=True, start_s=1.0, stop_s=3.0)
+    np.testing.assert_array_equal(found.t, t[(t >= 2_000_000) & (t < 4_000_000)])
+
+
+def test_times_that_know_their_unit_are_rounded_like_others(tmp_path: Path) -> None:
+    counts = np.array([0, 999, 1500, 1999, 2600])
+    for kind in "mM":
+        us = Hints().microseconds(counts.astype(f"{kind}8[ns]"), "us", 0)
+        np.testing.assert_array_equal(us, [0, 1, 2, 2, 3])
+        coarse = Hints().microseconds(counts.astype(f"{kind}8[ms]"), "us", 0)
+        np.testing.assert_array_equal(coarse, 1000 * counts)

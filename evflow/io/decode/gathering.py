@@ -40,6 +40,7 @@ class Gathering:
         self.reach = (0, 0)
         self.notes: list[Note] = []
         self.start, self.stop = hints.span_us(0)
+        self.clocked = False  # whether the range counts from the first event of all
         self.begun = hints.start_s is None  # whether the range has begun
         self.passed = False  # whether its end was seen; a jump there may be a single wrong time
         self.damage: tuple[EvflowDataError, BaseException] | None = None
@@ -71,10 +72,11 @@ class Gathering:
         written.seen(chunk.t, unit, self.native)
         t = self.hints.microseconds(chunk.t, self.native, self.offset)
         t = self.joint(t) if self.joint else t
-        if not self.seen:
+        if not self.clocked:
             self._narrow(chunk)
             self.first = self.last = int(t[0])
             self.start, self.stop = self.hints.span_us(self.first)
+            self.clocked = True
         return t
 
     def _sorted(self, chunk: Chunk, t: np.ndarray) -> bool:
