@@ -12,7 +12,7 @@ from evflow.errors import EvflowDataError
 from evflow.files.spool import Spool
 from evflow.io.decode.late import longest
 from evflow.io.hints import Hints
-from evflow.io.images.exposures import exposed_note
+from evflow.io.images.exposures import believed, exposed_note
 from evflow.light.colour import CONVERTED, luma, mosaic, seen_note
 from evflow.notes import Note
 from evflow.types import Events, Recording
@@ -86,7 +86,8 @@ class FrameStack:
         order, more = in_order(times, hints)
         if order is not None:
             frames, times = frames[order], times[order]
-        exposure_us = round(np.median(self.exposures))
+        exposure_us, doubted = believed(round(np.median(self.exposures)), times)
+        more = (*more, *doubted)
         if exposure_us:
             more = (*more, exposed_note(exposure_us))
         return Recording(events, frames, times, (*notes, *more), exposure_us)

@@ -66,7 +66,9 @@ class Stack:
         """The frames in OpenCV's channel order; EV009 if an .npz ends early."""
         read = self._members(partial) if self.member else self._mapped()
         times = self.times_us.tolist()
+        native = self.dtype.newbyteorder("=")
         for index, (pixels, time) in enumerate(zip(read, times, strict=not partial)):
+            pixels = pixels.astype(native, copy=False)
             order = [2, 1, 0, 3][: self.shape[3]] if len(self.shape) == 4 else []
             pixels = pixels[..., order] if len(order) >= 3 else pixels
             yield Image(pixels, time, f"frame {index} of {self.path}")

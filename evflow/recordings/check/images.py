@@ -59,10 +59,11 @@ def _depth(recording: Recording) -> list[Finding]:
     found = []
     if recording.frames.dtype == np.uint16:
         white = recording.full_scale
+        kind = f"as of {DEPTHS[white]}-bit data, " if white in DEPTHS else ""
         found.append(Finding(
-            "EV031", "note", f"16-bit frames, kept at full depth; their largest value, "
-            f"{int(recording.frames.max()):,}, suggests {DEPTHS[white]}-bit data with white at "
-            f"{white:,}.", "If white lies elsewhere, rescale them."))
+            "EV031", "note", "16-bit frames, kept at full depth; their largest value is "
+            f"{recording.frames.max():,}: {kind}white is taken as {white:,}.",
+            "If white lies elsewhere, rescale them."))
     colour = [note.text for note in recording.notes if note.code in LUMA]
     if colour:
         found.append(Finding(

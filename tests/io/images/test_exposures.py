@@ -11,6 +11,7 @@ import pytest
 from helpers.sources import message
 from helpers.videos import drifting
 
+from evflow import Events, Recording, read_recording, write_recording
 from evflow.io.images.exposures import Stamps, mid_exposure, noted, stated
 from evflow.io.images.times import read_times
 from evflow.io.source import open_frames
@@ -196,3 +197,15 @@ def test_one_note_at_most() -> None:
     assert [note.text[:32] for note in noted((old, other), 7_001, "as was given")] == [
         "in us", "frames are exposed for 7.001 ms,"]
     assert noted((old, other), 0) == (other,)
+
+
+@pytest.mark.parametrize("name", ["a.npz", "a.h5", "a.aedat4"])
+def test_an_exposure_longer_than_the_interval_is_not_believed(tmp_path: Path, name: str) -> None:
+    pytest.importorskip("aedat" if name.endswith("4") else "h5py")
+    events = Events(np.arange(20), np.arange(20), 20_000 * np.arange(20), np.ones(20, bool),
+                    (32, 24))
+    frames, times = np.stack(list(drifting(4, (24, 32)))).astype(np.uint8), 100_000 * np.arange(4)
+    write_recording(tmp_path / name, Recording(events, frames, times, exposure_us=150_000))
+    found = read_recording(tmp_path / name)
+    assert found.exposure_us == 0
+    assert any("longer than" in note.text for note in found.notes)

@@ -265,3 +265,16 @@ def test_pgms_that_name_two_whites_are_refused(tmp_path: Path) -> None:
     assert "0.pgm names 1023 as white (maxval), 1.pgm 4095" in message(
         lambda: read(tmp_path, fps=10))
     assert read(tmp_path, fps=10, full_scale=4095)[0].max() == pytest.approx(31.1, abs=0.1)
+
+
+def test_stacks_of_the_other_byte_order_are_the_same(tmp_path: Path) -> None:
+    """Of 12 bits in 16, they have to be given their white as well."""
+    deep = (LIGHT * 15).astype("<u2")
+    for order in "<>":
+        np.save(tmp_path / "s.npy", deep.astype(f"{order}u2"))
+        np.savez(tmp_path / "s.npz", frames=deep.astype(f"{order}u2"))
+        for name in ("s.npy", "s.npz"):
+            with pytest.raises(EvflowDataError, match=r"EV003.*full-scale 4095"):
+                read(tmp_path / name, fps=30)
+            frames = read(tmp_path / name, fps=30, full_scale=4095)[0]
+            np.testing.assert_allclose(frames, LIGHT * 15 * 255 / 4095, atol=0.07)

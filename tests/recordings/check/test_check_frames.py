@@ -206,3 +206,11 @@ def test_a_cut_off_text_and_aedat4_are_read_in_part(
     part = read_recording(cut, partial=True)
     assert 50_000 < len(part.events) < 300_000
     assert part.has_frames
+
+
+def test_any_white_of_deep_frames_is_reported(watched: tuple[Recording, Camera]) -> None:
+    deep = dataclasses.replace(watched[0], frames=watched[0].frames.astype(np.uint16) * 16)
+    for white, said in ((4095, "12-bit data, white is taken as 4,095"),
+                        (5000, "white is taken as 5,000")):
+        given = dataclasses.replace(deep, full_scale=white)
+        assert any(said in str(f) for f in check(given).findings if f.code == "EV031")
