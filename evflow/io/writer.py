@@ -66,6 +66,7 @@ class EventWriter(abc.ABC):
                 "EV003", f"{self.NAME} holds sensors of up to {self.MAX_SIDE} pixels a side, not "
                 f"{self.size[0]}x{self.size[1]}.", "Write dsec or npz.")
         self._waiting: list[Events] = []
+        self._count = 0  # of the events that wait
         self._last_us = self._last_frame_us = np.zeros(0, np.int64)
         self._depth: np.dtype | None = None
 
@@ -124,7 +125,8 @@ class EventWriter(abc.ABC):
         self._check(events)
         self._last_us = events.t[-1:].copy()
         self._waiting.append(events)
-        if sum(map(len, self._waiting)) >= FLUSH:
+        self._count += len(events)
+        if self._count >= FLUSH:
             self._flush()
         else:
             self._waiting[-1] = _copied(events)  # the caller may reuse the arrays
@@ -213,7 +215,7 @@ class EventWriter(abc.ABC):
 
     def _flush(self) -> None:
         if self._waiting:
-            events, self._waiting = Events.concatenate(self._waiting), []
+            events, self._waiting, self._count = Events.concatenate(self._waiting), [], 0
             for part in blocks(events, FLUSH):
                 with self._guard():
                     self._write(part)

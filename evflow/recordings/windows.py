@@ -9,6 +9,7 @@ event rate stands at a ceiling, where events are missing.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import re
 import weakref
 from collections.abc import Iterator
@@ -122,8 +123,8 @@ class _Obstacles:
         if len(silent):
             return (f"no events for {np.ptp(silent[0]) / 1e3:.1f} ms (lost packets, or a static "
                     "scene?)"), last
-        edges = np.clip(self.capped, self.times[first], self.times[last])
-        if np.diff(edges).sum() > CAPPED * (self.times[last] - self.times[first]):
+        at_ceiling = self._capped_before(last) - self._capped_before(first)
+        if at_ceiling > CAPPED * (self.times[last] - self.times[first]):
             return (f"the event rate stands at a ceiling of {self.capped_per_s:,.0f} events/s "
                     "(readout or rate control?), where events are lost"), last
         faults = [(i, why) for i, why in self.glitches.items() if first <= i <= last] + [
@@ -131,6 +132,19 @@ class _Obstacles:
         if faults:
             return faults[0][1], max(i for i, _ in faults) + 1
         return None
+
+
+    @functools.cached_property
+    def _capped_us(self) -> np.ndarray:
+        """(M + 1,) us at the ceiling before each span, and in all."""
+        return np.concatenate([[0], np.cumsum(np.diff(self.capped).ravel())])
+
+    def _capped_before(self, frame: int) -> int:
+        """us at the ceiling before a frame; spans are in order and apart."""
+        time = self.times[frame]
+        k = int(np.searchsorted(self.capped[:, 0], time))
+        over = max(int(self.capped[k - 1, 1] - time), 0) if k else 0
+        return int(self._capped_us[k]) - over
 
 
 _KNOWN: weakref.WeakKeyDictionary[Recording, _Obstacles] = weakref.WeakKeyDictionary()

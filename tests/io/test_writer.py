@@ -280,7 +280,7 @@ def test_a_folder_of_somebody_is_never_replaced(tmp_path: Path) -> None:
     assert "thesis.tex" in str(error)
     assert (folder / "thesis.tex").read_text() == "dear to me"
     (tmp_path / "file").write_text("dear to me")
-    assert refusal(tmp_path / "file", recording, "evreal", overwrite=True).code == "EV019"
+    assert refusal(tmp_path / "file", recording, "evreal", overwrite=True).code == "EV013"
     assert sorted(os.listdir(tmp_path)) == ["file", "mine"]
     assert refusal(tmp_path / "file" / "new", recording, "evreal").code == "EV019"
 

@@ -8,6 +8,7 @@ import pytest
 from evflow.recordings import ceiling, plan_windows
 from evflow.recordings.ceiling import rate_ceiling
 from evflow.recordings.check.rules import check
+from evflow.recordings.windows import _Obstacles
 from evflow.types import Events, Recording
 
 SECONDS = 2.0
@@ -101,3 +102,14 @@ def test_check_says_that_the_rate_is_capped() -> None:
 def test_events_that_wait_make_no_error_of_clocks() -> None:
     late = recording(queued(varied(100_000), 8.0))
     assert {f.severity for f in check(late).findings if f.code == "EV024"} <= {"warning"}
+
+
+def test_time_at_a_ceiling_is_counted_within_a_window() -> None:
+    rng = np.random.default_rng(1)
+    capped = np.sort(rng.choice(1000, 40, replace=False)).reshape(-1, 2)
+    times = np.arange(0, 1001, 37)
+    nothing = np.zeros(0, np.int64)
+    obstacles = _Obstacles(times, nothing, np.zeros((0, 2), np.int64), capped, 1e6, {}, {})
+    before = [obstacles._capped_before(i) for i in range(len(times))]
+    np.testing.assert_array_equal(
+        before, [np.diff(np.clip(capped, 0, t)).sum() for t in times])

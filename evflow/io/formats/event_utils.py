@@ -125,7 +125,8 @@ class EventUtilsWriter(Hdf5Writer):
 
     def _open(self, temporary: Path, stack: contextlib.ExitStack) -> None:
         super()._open(temporary, stack)
-        self._on, self._first_s, self._image_s = 0, 0.0, np.zeros(0)
+        self._on, self._first_s = 0, 0.0
+        self._image_s: list[float] = []
         for name, dtype in zip(COLUMNS, ("i2", "i2", "f8", "?"), strict=True):
             self._create(f"events/{name}", (), dtype, self.CHUNK)
 
@@ -144,7 +145,7 @@ class EventUtilsWriter(Hdf5Writer):
             image.attrs.update(size=frame.shape, timestamp=second, type="greyscale")
             if self.exposure_us:
                 image.attrs[KEY] = np.int64(self.exposure_us)
-            self._image_s = np.append(self._image_s, second)
+            self._image_s.append(float(second))
             self._disk.check()
 
     def _finish(self) -> None:
