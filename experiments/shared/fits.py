@@ -18,7 +18,7 @@ from experiments.shared import alone
 from experiments.shared.cameras import Hidden, Protocol
 from experiments.shared.compared import CONSTANT, KNOWN, OURS, POLARITIES
 from experiments.shared.kept import Row, resumed
-from experiments.shared.many import Setup, made
+from experiments.shared.many import Setup, enough, made
 from experiments.shared.protocols import ENOUGH
 
 
@@ -77,9 +77,12 @@ def all_scores(setup: Setup, systems: dict[str, System], protocol: tuple[str, Pr
 
     def scored(left: list[int]) -> Iterator[Row]:
         found = made(lively, setup, [(i, drawn) for i in range(4 * count)], 1)
-        for i, one in enumerate(itertools.islice((f for f in found if f is not None), count)):
-            if i in left:
+        fit = itertools.islice((f for f in found if f is not None), count)
+        seen = 0
+        for seen, one in enumerate(fit, 1):
+            if (i := seen - 1) in left:
                 yield score(*one, {n: s for n, s in systems.items() if i < s.most_recordings})
+        enough([None] * seen, count)
 
     of = [weights_hash(setup.weights), setup.seed, *map(repr, systems.values())]
     return resumed(path, of, [f"{name}, {i}" for i in range(count)], scored, f"mismatch {name}")

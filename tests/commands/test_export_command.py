@@ -19,7 +19,7 @@ from evflow.camera.exports import TARGETS, export_camera
 from evflow.camera.exports.common import LIGHT, NOISE
 from evflow.camera.exports.iebcs import FREQUENCIES, spectrum
 from evflow.camera.optics import Optics
-from evflow.camera.sensors import SensorModel
+from evflow.camera.sensors import DeadContrast, SensorModel
 from evflow.cli import main
 from evflow.io.source import open_frames
 from evflow.light.response import linear_light
@@ -69,8 +69,8 @@ def test_what_dead_time_and_shot_noise_lose_is_told(to: str) -> None:
 @pytest.mark.parametrize("to", list(TARGETS))
 def test_how_a_dead_time_differs_from_the_camera_is_told(to: str) -> None:
     """Of a camera that keeps contrast in it, drops its events, or begins anew at its end."""
-    for law, lost in (("keeps", "keep it for later"), ("drops", "as by this camera's"),
-                      ("resets", "begin anew")):
+    drops = "begin anew" if to == "iebcs" else "as by this camera's"
+    for law, lost in (("keeps", "keep it for later"), ("drops", drops), ("resets", "begin anew")):
         sensor = SensorModel(refractory_s=1e-3, dead_contrast=law)
         told = export_camera(Camera.constant((4, 6)), to, sensor=sensor)[0].text
         kept = "dead time is kept for later" in told
@@ -339,3 +339,13 @@ def test_export_errors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
 
     with pytest.raises(EvflowDataError, match="EV020"):
         export_camera(Camera.constant((4, 4)), "airsim")
+
+
+@pytest.mark.parametrize(("contrast", "said"), [
+    ("drops", "This camera's drop the events"), ("resets", "as this camera's"),
+    ("auto", "the pixels of v2e and")])
+def test_iebcs_begins_anew_after_the_dead_time(contrast: DeadContrast, said: str) -> None:
+    """Its pixels take the light at the end of their dead time into memory."""
+    sensor = SensorModel(refractory_s=2e-3, dead_contrast=contrast)
+    camera = Camera.sample(jax.random.key(0), (24, 32))
+    assert said in export_camera(camera, "iebcs", sensor=sensor)[0].text

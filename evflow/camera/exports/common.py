@@ -35,6 +35,13 @@ LOSES: Mapping[str, str] = {  # programs whose pixels drop events; by SensorMode
     "resets": '''- Events that fall into the dead time are dropped. This camera's pixels begin anew
   at its end, and send fewer where light changes fast.
 '''}
+ANEW: Mapping[str, str] = {  # programs whose pixels begin anew at the end of the dead time
+    **LOSES,
+    "drops": '''- Pixels begin anew at the end of the dead time. This camera's drop the events that
+  fall into it but keep the rest of the contrast, and send more where light changes fast.
+''',
+    "resets": '''- Pixels begin anew at the end of the dead time, as this camera's.
+'''}
 KEEPS = '''- Contrast that changes within the dead time is kept for later; this camera's pixels lose
   it. Where light changes fast, there are more events (1.1 to 1.5 times, with 2 and 5 ms).
 '''
@@ -134,6 +141,11 @@ class Settings:
         dead = f"dead time {1e3 * self.dead_s:.2f} ms" if self.dead_s else "no dead time"
         leak = f", leak {self.leak_hz:.3f} Hz (part of the ON noise)" if self.leak_hz else ""
         return f"{cutoff}, {dead}{leak}"
+
+    @property
+    def begun_anew(self) -> str:
+        """What a program says of the dead time whose pixels begin anew at its end."""
+        return ANEW[self.dead_contrast]
 
     @property
     def dropped(self) -> str:

@@ -85,7 +85,7 @@ def export(maps: Maps, s: Settings) -> Export:
     rates = {"bgnp": max(s.eta_on, slowest), "bgnn": max(s.eta_off, slowest)}
     values = vars(s) | rates | {
         "light": LIGHT + SWITCH, "srgb": SRGB, "same_size": s.same_size, "sigma": s.sigma,
-        "refers_to": s.refers_to, "circuit": s.circuit, "dead": s.dropped,
+        "refers_to": s.refers_to, "circuit": s.circuit, "dead": s.begun_anew,
         "light_lost": s.light_lost,
         "dead_us": round(s.dead_s * 1e6) or USUAL_DEAD_US}
     arrays = {"noise_pos.npy": spectrum(maps["eta_on"]), "noise_neg.npy": spectrum(maps["eta_off"])}
