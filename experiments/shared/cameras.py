@@ -17,6 +17,7 @@ from evflow import Recording, simulate
 from evflow.camera import Camera, CameraPrior, Summary, sample_pixels
 from evflow.camera.optics import Optics
 from evflow.camera.sensors import SensorModel
+from evflow.light.log_maps import noise_factor, normalised_intensity
 from evflow.scenes import TextureBank, watch
 from evflow.scenes.config import SceneConfig
 from evflow.simulator.photoreceptor import as_measured, seen_frames
@@ -59,8 +60,9 @@ class Protocol:
 class Hidden:
     """A recording and the truth behind it.
 
-    nominal: at the recording's mean intensity; video: (T, H, W) DN at 1000 frames/s, of which the
-    recording keeps the frames `kept` (K+1,); noise: (N,) bool, events that are noise.
+    camera, nominal: noise rates are those of all noise but leak, at the recording's mean intensity;
+    video: (T, H, W) DN at 1000 frames/s, of which the recording keeps the frames `kept` (K+1,);
+    noise: (N,) bool, events that are noise.
     """
 
     recording: Recording
@@ -78,6 +80,7 @@ class Hidden:
         return np.array([events.p.sum(), (~events.p).sum()]) - np.array(noise)
 
 
+WHITE_DN, EVERY = 255.0, 20  # of the frames at 1000 frames/s of which light is the mean
 BLACK, WHITE = 20.0, 250.0  # DN of a fade: its black when darkest, its white when brightest
 UNREACHED = 8.0  # a threshold beyond every change of 8-bit frames
 
@@ -110,6 +113,31 @@ def low_passed(
     return np.stack([frame for frame, _ in seen_frames(pairs, seen_by)]), behind
 
 
+def with_dark_light(frames: np.ndarray, dark_dn: float) -> np.ndarray:
+    """The light (T, H, W) on pixels that see so many DN more than the frames show, darker by one
+    factor, which is no contrast, so that nothing is brighter than white."""
+    if not dark_dn:
+        return frames
+    return (frames + np.float32(dark_dn)) * np.float32(WHITE_DN / (WHITE_DN + dark_dn))
+
+
+def with_shot_noise(
+    camera: Camera, nominal: Summary, light: np.ndarray, model: SensorModel
+) -> tuple[Camera, Summary]:
+    """The camera, and its summary, with v2e's shot noise among their noise rates: half of it each
+    polarity, by the light (T, H, W) DN, and more at lower thresholds."""
+    if not model.shot_hz:
+        return camera, nominal
+    factor = np.asarray(noise_factor(normalised_intensity(light[::EVERY]))).mean(0)
+    for name in ("on", "off"):
+        theta, eta = np.asarray(getattr(camera, f"theta_{name}")), f"eta_{name}"
+        more = 0.5 * model.shot_hz * factor * np.median(theta) / theta
+        camera = dataclasses.replace(camera, **{eta: getattr(camera, eta) + more})
+        nominal = dataclasses.replace(
+            nominal, **{eta: getattr(nominal, eta) + np.float32(more.mean())})
+    return camera, nominal
+
+
 def hidden_recording(key: Array, bank: TextureBank, protocol: Protocol) -> Hidden:
     """Draw a scene and a camera; simulate the recording."""
     k_scene, k_nominal, k_pixels, k_events, k_noise = jax.random.split(key, 5)
@@ -126,22 +154,23 @@ def hidden_recording(key: Array, bank: TextureBank, protocol: Protocol) -> Hidde
         nominal = dataclasses.replace(nominal, theta_off=jnp.float32(UNREACHED))
         camera = sample_pixels(k_pixels, nominal, protocol.shape, prior.eta_spread)
     times = np.arange(length) * 1000
-    lit = np.minimum(frames + np.float32(protocol.dark_dn), 255) if protocol.dark_dn else frames
-    lit, model = low_passed(lit, times, protocol)
-    events, labels = simulate(k_events, lit, times, camera, model=model, labels=True,
-                              full_scale=255)
+    lit = with_dark_light(frames, protocol.dark_dn)
+    shown, model = low_passed(lit, times, protocol)
+    events, labels = simulate(k_events, shown, times, camera, model=model, labels=True,
+                              full_scale=WHITE_DN)
     if protocol.off == "dropped":
         on = events.p
         labels = labels[on]
         events = Events(events.x[on], events.y[on], events.t[on], events.p[on], events.size)
     kept = np.arange(lead, length, protocol.frame_ms)
-    shown = _exposed(frames, kept, protocol.exposure_ms) + np.float32(protocol.black_dn)
-    gray = np.asarray(watch.recorded(k_noise, shown, protocol.frame_noise_dn), np.uint8)
+    read = _exposed(frames, kept, protocol.exposure_ms) + np.float32(protocol.black_dn)
+    gray = np.asarray(watch.recorded(k_noise, read, protocol.frame_noise_dn), np.uint8)
     gain = watch.noise_gain(protocol.model, light, light[0])
     exposure_us = 1000 * protocol.exposure_ms * protocol.exposure_known
     recording = Recording(events, gray, times[kept], exposure_us=exposure_us)
-    return Hidden(recording, watch.with_noise(camera, gain), watch.with_noise(nominal, gain),
-                  frames, kept, labels)
+    return Hidden(recording, *with_shot_noise(
+        watch.with_noise(camera, gain), watch.with_noise(nominal, gain), lit, protocol.model),
+        frames, kept, labels)
 
 
 FRAME_MS = (10, 20, 25, 25, 33, 40)

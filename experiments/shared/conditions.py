@@ -23,7 +23,7 @@ import numpy as np
 from evflow import Recording, estimate_camera, load_weights
 from evflow.baselines import SYSTEMS
 from evflow.camera import THETA_MIN, Camera, Summary, sample_pixels
-from evflow.camera.optics import Optics, read_sensor
+from evflow.camera.optics import Optics, read_sensor, read_shared
 from evflow.camera.sensors import SensorModel
 from evflow.downstream.prior import WidePrior
 from evflow.errors import EvflowDataError
@@ -141,12 +141,12 @@ class Workshop:
             lambda m: jax.lax.dynamic_slice(m, corner, self.shape), whole))(rows, columns)
 
     def stored(self, path: Path) -> Camera:
-        """Draws from the estimate in a file, or the maps in it."""
+        """Draws from the estimate in a file, as `evflow simulate --draw`, or the maps in it."""
         camera, std = Camera.load_with_std(path)
         if std is None:
             return self.parts(camera)
-        keys = jax.random.split(jax.random.key(3), self.count)
-        return jax.vmap(lambda key, part, error: part.drawn(key, error))(
+        keys, shared = jax.random.split(jax.random.key(3), self.count), read_shared(path)
+        return jax.vmap(lambda key, part, error: part.drawn(key, error, shared))(
             keys, self.parts(camera), self.parts(std))
 
     def estimated(self, target: AnyTarget) -> Camera:

@@ -11,9 +11,8 @@ import numpy as np
 from evflow.camera import CameraPrior
 from evflow.camera.sensors import SENSORS, SecondOrder, SensorModel
 from evflow.errors import EvflowDataError
-from evflow.light.log_maps import noise_factor, normalised_intensity
 from evflow.scenes.config import SceneConfig
-from experiments.shared.cameras import Hidden, Protocol
+from experiments.shared.cameras import Protocol
 
 BASE = Protocol(
     prior=CameraPrior(theta=(0.12, 0.45)), shape=(120, 160), frame_ms=40, intervals=24,
@@ -69,16 +68,6 @@ def known(conditions: Sequence[str]) -> Sequence[str]:
 def added_light(protocol: Protocol) -> float:
     """DN of light that pixels see in addition to the frames'."""
     return protocol.dark_dn - protocol.black_dn
-
-
-def shot_rates(hidden: Hidden, protocol: Protocol) -> np.ndarray:
-    """(2, H, W) true noise rates ON and OFF in Hz: v2e's shot noise and eta, without leak."""
-    frames = hidden.recording.frames.astype(np.float64) - protocol.black_dn
-    factor = noise_factor(normalised_intensity(np.clip(frames, 0.0, 255.0))).mean(0)
-    half, camera = 0.5 * protocol.model.shot_hz * np.asarray(factor), hidden.camera
-    return np.stack([
-        np.asarray(eta) + half * np.median(theta) / np.asarray(theta)
-        for eta, theta in ((camera.eta_on, camera.theta_on), (camera.eta_off, camera.theta_off))])
 
 
 def draw_real(rng: np.random.Generator) -> Protocol:

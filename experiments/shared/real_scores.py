@@ -13,7 +13,7 @@ from evflow.camera.optics import MEASURED
 from evflow.errors import EvflowDataError
 from experiments.shared.cameras import Hidden, Protocol
 from experiments.shared.kept import Row
-from experiments.shared.real_cameras import CHANGES, added_light, shot_rates
+from experiments.shared.real_cameras import CHANGES, added_light
 
 LABELS = {"cutoff_hz": "cutoff [Hz]", "refractory_s": "dead time [s]", "leak_hz": "leak [Hz]"}
 SLOW = [name for name, change in CHANGES.items()
@@ -57,7 +57,7 @@ def score(params: Any, hidden: Hidden, protocol: Protocol) -> Row:
         "light": [optics.offset_dn, finite(optics.offset_dn_std), added_light(protocol)]}
     if protocol.model.shot_hz:
         maps = np.stack([found.camera.eta_on, found.camera.eta_off])
-        sides = maps, shot_rates(hidden, protocol)
+        sides = maps, np.stack([hidden.camera.eta_on, hidden.camera.eta_off])
         row["noise"] = [[[float(of(m)) for m in both] for both in sides]
                         for of in (np.mean, np.median)]
     return row

@@ -10,7 +10,14 @@ import pytest
 
 from evflow.estimation.refine.path_signs import NAMES, NEEDED
 from experiments.fuse import AS_DRAWN, EXPOSURE_TOLD, KINDS, OTHER_SHAPES, drawn, told
-from experiments.shared.fusion_fit import cross_validated, fit, of_kinds, predict, scaling_of
+from experiments.shared.fusion_fit import (
+    cross_validated,
+    fit,
+    folds_of,
+    of_kinds,
+    predict,
+    scaling_of,
+)
 from experiments.shared.real_cameras import draw_real, draw_single
 
 EVENTS, ROWS = 4, 600
@@ -84,6 +91,13 @@ def test_a_continued_fit_clips_to_both_ranges(
     assert new["low"][0] < 1.5 * fusion["low"][0]
     assert (new["low"][1], new["high"][1]) == (fusion["low"][1], fusion["high"][1])
     assert new["scale"] is fusion["scale"]
+
+
+def test_every_fold_has_recordings_of_every_kind() -> None:
+    folds = folds_of(3000, 0)
+    for regular in (AS_DRAWN, EXPOSURE_TOLD, len(KINDS)):
+        assert set(folds[::regular]) == set(folds)
+    assert np.ptp(np.bincount(folds)) <= 1
 
 
 def test_size_and_scenes_do_not_betray_the_kind_of_camera() -> None:
