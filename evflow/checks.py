@@ -204,8 +204,12 @@ def check_coordinates(x: np.ndarray, y: np.ndarray, size: Size) -> tuple[np.ndar
     return x.astype(np.uint16, copy=False), y.astype(np.uint16, copy=False)
 
 
-def check_frames(frames: np.ndarray, size: Size) -> None:
-    """Check shape (T, H, W), dtype, size and finite values; raises EV002, EV003, EV007, EV015."""
+def check_frames(frames: np.ndarray, size: Size, full_scale: int = 0) -> None:
+    """Check shape (T, H, W), dtype, size and finite values; raises EV002, EV003, EV007, EV015.
+
+    full_scale: the DN of white, 0 if it is unknown; float frames are not taken for fractions of
+    white if it is known, as that of a part of a recording is: dark parts are not fractions.
+    """
     width, height = size
     if frames.ndim == 4 and frames.shape[-1] in (3, 4):
         raise EvflowDataError(
@@ -226,10 +230,10 @@ def check_frames(frames: np.ndarray, size: Size) -> None:
             "EV015", f"frames are {frames.shape[2]}x{frames.shape[1]} (width x height) but events "
             f"are {width}x{height}.", f"Both must come from the same sensor, uncropped.{swapped}")
     if frames.dtype == np.float32 and len(frames):
-        _float_frames(frames)
+        _float_frames(frames, white_known=full_scale >= 255)
 
 
-def _float_frames(frames: np.ndarray) -> None:
+def _float_frames(frames: np.ndarray, white_known: bool) -> None:
     for index, frame in enumerate(frames):  # one by one: no (T, H, W) temporary
         finite = np.isfinite(frame)
         if not finite.all():
@@ -237,9 +241,11 @@ def _float_frames(frames: np.ndarray) -> None:
                 "EV007", f"frame {index} has {(~finite).sum():,} NaN or infinite values.",
                 "Frames must be linear DN; a logarithm of pixels <= 0, or missing pixels?")
     low, high = float(frames.min()), float(frames.max())
-    if low < 0 or high > 255 or 0 < high <= 1:
-        fix = ("Multiply by 255, if 1 is white. Frames that are really so dark tell nothing: leave "
-               "them out (--no-frames)." if low >= 0 and high <= 1 else "Rescale, or pass uint16.")
+    fractions = low >= 0 and 0 < high <= 1 and not white_known
+    if low < 0 or high > 255 or fractions:
+        fix = ("Multiply by 255, if 1 is white. If they are really so dark: Recording(..., "
+               "full_scale=255); of a file, leave them out: --no-frames." if fractions else
+               "Rescale, or pass uint16.")
         raise EvflowDataError(
             "EV003", f"float frames span {low:g}..{high:g}; expected DN 0..255.", fix)
 

@@ -219,6 +219,20 @@ def test_parts_of_a_recording_keep_its_full_scale() -> None:
     assert Recording(events(), stack, [1, 2], full_scale=1023).full_scale == 4095
 
 
+def test_dark_parts_of_float_frames_are_not_fractions_of_white() -> None:
+    stack = frames(dtype=np.float32) + 20
+    stack[1] /= 250
+    recording = Recording(events(), stack, [1, 2])
+    part = dataclasses.replace(recording, frames=stack[1:], frame_times=[2])
+    np.testing.assert_array_equal(part.frame_dn(0), stack[1])
+    assert Recording(events(), stack[1:], [2], full_scale=255).full_scale == 255
+    for unsure in (0, 1):
+        error = code_of(lambda white=unsure: Recording(
+            events(), stack[1:], [2], full_scale=white))
+        assert error.code == "EV003"
+        assert "full_scale=255" in error.fix
+
+
 def test_recording_without_frames() -> None:
     recording = Recording.of_events(events())
     assert not recording.has_frames

@@ -83,7 +83,8 @@ def _given(recording: Recording, run: list[int], steps: int) -> Chunk:
     whose path is the video."""
     index = np.arange(run[0], run[0] + len(run) // steps * steps + 1)
     events, times = recording.events, recording.frame_times[index[::steps]]
-    coarse = Recording(events, recording.frames[index[::steps]], times)
+    coarse = Recording(events, recording.frames[index[::steps]], times,
+                       full_scale=recording.full_scale)
     chunk = make_chunk(coarse, list(range(len(times) - 1)), steps)
     path = np.asarray(lin_log(np.stack([recording.frame_dn(int(i)) for i in index])))
     evidence = pixel_evidence(events, times, path, steps, first=run[0] == 0)

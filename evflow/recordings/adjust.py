@@ -126,7 +126,7 @@ def with_frames(
     notes = (*noted(recording.notes, 0), Note("frames.replaced", f"frames come from {path}"),
              *(Note(note.code, _reworded(note.text)) for note in source.notes))
     return Recording(recording.events, np.stack(kept), np.array(times, np.int64), notes,
-                     source.exposure_us)
+                     source.exposure_us, full_scale=255)  # `open_frames` has looked for white
 
 
 def _reworded(text: str) -> str:

@@ -36,8 +36,9 @@ class Recording:
         exposure_us: exposure time of the frames, the median if it changes; 0 if it is unknown.
         full_scale: the DN of a saturated pixel. Of uint8 and float32 frames it is 255; of uint16
             ones the maximum of the smallest converter (8, 10, 12, 14 or 16 bits: 255, 1023, 4095,
-            16383, 65535) that covers all frames, unless a higher one is given. A part of a
-            recording made by `dataclasses.replace` keeps it.
+            16383, 65535) that covers all frames, unless a higher one is given. Float32 frames
+            that nowhere exceed 1 are taken for fractions of white and refused, unless it is given
+            as 255. A part of a recording made by `dataclasses.replace` keeps it.
 
     Raises:
         EvflowDataError: EV002 (shape, or colour), EV003 (dtype, or range of float frames), EV004
@@ -61,7 +62,8 @@ class Recording:
         need(self.events, Events, "events", "For a path: evflow.read_recording(path).")
         frames, times = (np.asarray(plain(name, getattr(self, name)))
                          for name in ("frames", "frame_times"))
-        check_frames(frames, self.events.size)
+        full_scale = check_full_scale(self.full_scale)
+        check_frames(frames, self.events.size, full_scale)
         if times.shape != frames.shape[:1]:
             raise EvflowDataError(
                 "EV002", f"frame_times has shape {times.shape} for {len(frames)} frames.",
@@ -70,8 +72,7 @@ class Recording:
         for note in self.notes:
             need(note, Note, "a note", "For a sentence: evflow.notes.Note(code, sentence).")
         object.__setattr__(self, "exposure_us", check_exposure(self.exposure_us))
-        object.__setattr__(self, "full_scale",
-                           _white(frames, check_full_scale(self.full_scale)))
+        object.__setattr__(self, "full_scale", _white(frames, full_scale))
         object.__setattr__(self, "frames", read_only(frames))
         object.__setattr__(self, "frame_times", read_only(times))
 

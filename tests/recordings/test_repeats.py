@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from helpers.videos import drifting
 
 from evflow import Events, Recording
-from evflow.recordings.repeats import repeated_frames, without_repeats
+from evflow.recordings.repeats import ends_stale, repeated_frames, without_repeats
 
 WIDTH, HEIGHT = 32, 24
 RNG = np.random.default_rng(0)
@@ -62,6 +64,13 @@ def test_scenes_that_stand_still_keep_their_frames(given: Recording) -> None:
 def test_the_check_names_what_is_left_out() -> None:
     given = recording(TWICE)
     assert repeated_frames(given).tolist() == list(range(1, 40, 2))
+
+
+def test_dark_frames_at_the_end_are_looked_at() -> None:
+    given = recording(np.arange(30))
+    frames = given.frames.astype(np.float32)
+    frames[-2:] /= 300
+    assert ends_stale(dataclasses.replace(given, frames=frames)) is None
 
 
 def test_frames_without_a_picture_repeat_nothing() -> None:

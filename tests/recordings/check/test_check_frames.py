@@ -51,6 +51,8 @@ def test_a_response_is_undone(watched: tuple[Recording, Camera]) -> None:
     assert linearised(recording, "linear") is recording
     with pytest.raises(EvflowDataError, match="EV020"):
         linearised(recording, "log")
+    dark = linearised(dataclasses.replace(recording, frames=recording.frames // 24), "srgb")
+    assert 0 < dark.frames.max() < 1  # of codes up to 10; not fractions of white
 
 
 @pytest.mark.slow
@@ -118,6 +120,11 @@ def test_frames_come_from_a_stack(watched: tuple[Recording, Camera], tmp_path: P
     assert late.frame_times.tolist() == [0, 1_000_000]
     with pytest.raises(EvflowDataError, match=r"EV012.*--frames-offset-ms"):
         with_frames(bare, tmp_path / "frames.npy", fps=25, offset_us=10_000_000)
+    np.save(tmp_path / "dark.npy", recording.frames / np.float32(255))
+    with pytest.raises(EvflowDataError, match="EV003"):
+        with_frames(bare, tmp_path / "dark.npy", fps=25)
+    dark = with_frames(bare, tmp_path / "dark.npy", fps=25, full_scale=255)
+    assert dark.frames.max() <= 1
     np.save(tmp_path / "small.npy", recording.frames[:, :10])
     with pytest.raises(EvflowDataError, match="EV015"):
         with_frames(bare, tmp_path / "small.npy", fps=25)
