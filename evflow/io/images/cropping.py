@@ -94,7 +94,7 @@ def scaled(frame: Array, size: Size) -> Array:
     shrinks = size[0] <= frame.shape[1] and size[1] <= frame.shape[0]
     out: Array = cv2.resize(light, size, interpolation=cv2.INTER_AREA if shrinks else
                             cv2.INTER_LINEAR)
-    return out
+    return np.minimum(out, 255, out=out)  # an average is no brighter than white, but for rounding
 
 
 def slowed(source: FrameSource, factor: float) -> FrameSource:

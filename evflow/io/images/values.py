@@ -1,5 +1,5 @@
 """Pixel values of a decoded image -> light on 0..255 DN: uint8 stays if it already is that, all
-else becomes float32. Nothing is clipped.
+else becomes float32. Nothing is clipped, but for what rounding leaves just above white.
 
 The response is undone before colours are summed: a pixel adds light, not code values.
 """
@@ -22,6 +22,7 @@ from evflow.notes import Note
 
 WHITE = {"u1": 255.0, "u2": 65535.0, "f4": 255.0}  # default DN of a saturated pixel
 WHITE_PERCENT = 99.0
+NEARLY = 1.001  # times white: what a conversion or a filter rounds up to is still white
 USUAL = {int(WHITE["u1"]), int(WHITE["u2"])}
 NETPBM, HEAD = (".pgm", ".ppm"), 1 << 12  # bytes in which these name their white
 BACKGROUNDS = {"black": 0.0, "white": 1.0}
@@ -120,13 +121,18 @@ def _scaled(pixels: np.ndarray, where: str, full_scale: float | None) -> np.ndar
     floats = pixels.dtype == np.float32
     if low < 0 and (meant := meaning(pixels)):
         raise misread(meant, where, pixels, white)
-    if high > white * 1.001:
+    if high > white * NEARLY:
         likely = high if floats else likely_white(high)
         raise EvflowDataError(
             "EV003", f"{where} reaches {high:g}, beyond white at {white:g}.",
             f"Pass the value of white: --full-scale {likely:g} (full_scale=).",
             where=where)
-    return pixels.astype(np.float32) * np.float32(255 / white)
+    return _below_white(pixels.astype(np.float32) * np.float32(255 / white))
+
+
+def _below_white(dn: np.ndarray) -> np.ndarray:
+    """DN (overwritten) with white itself and what was admitted just above it at 255."""
+    return np.minimum(dn, np.float32(255), out=dn)
 
 
 def misread(meant: Meaning, where: str, pixels: np.ndarray, white: float) -> EvflowDataError:
@@ -147,7 +153,7 @@ def _exponential(pixels: np.ndarray, where: str, full_scale: float | None) -> np
             "EV003", f"{where} reaches {high:.4g}, but the logarithm of white, {white:g}, is "
             f"{np.log(white):.4g}.", f"Pass the value of white: --full-scale {np.exp(high):.4g}, "
             "or leave out --response log.", where=where)
-    return np.exp(pixels) * np.float32(255 / white)
+    return _below_white(np.exp(pixels) * np.float32(255 / white))
 
 
 def _check_finite(pixels: np.ndarray, where: str) -> None:

@@ -49,6 +49,14 @@ def test_a_new_pixel_collects_the_light_of_its_area(
         all_of(cropped(source(colour), **options))[..., 0], expected, rtol=1e-5)
 
 
+def test_rounding_makes_nothing_brighter_than_white() -> None:
+    white = np.full((1, 180, 240), 255, np.uint8)
+    for resize in ("77x59", "500x333"):
+        np.testing.assert_allclose(
+            all_of(cropped(source(white), resize=resize)), 255, rtol=1e-6)
+        assert all_of(cropped(source(white), resize=resize)).max() <= 255
+
+
 @pytest.mark.parametrize(("name", "size"), [
     ("davis346", (346, 260)), ("DAVIS 240", (240, 180)), ("dvs128", (128, 128)),
     ("evk4", (1280, 720)), ("GenX320", (320, 320)), ("100x50", (100, 50))])

@@ -206,6 +206,18 @@ def test_light_whose_white_lies_elsewhere_is_told(
     assert noted(full_scale=255) == ""
 
 
+@pytest.mark.parametrize(("white", "peak"), [(0.6, 0.6), (1.0, 1.0005), (4095, 4095)])
+def test_white_is_255_however_it_is_rounded(tmp_path: Path, white: float, peak: float) -> None:
+    light = np.linspace(0.1, 1, 3 * 9 * 16).reshape(3, 9, 16)
+    path = stack(tmp_path / "s", (peak * light).astype(np.float32))
+    seen = read(path, fps=10, full_scale=white)[0]
+    assert seen.max() == 255
+    np.testing.assert_allclose(seen, np.minimum(255 * peak / white * light, 255), rtol=1e-6)
+    logs = stack(tmp_path / "l", np.log(peak * light).astype(np.float32))
+    assert read(logs, fps=10, full_scale=white, response="log")[0].max() == pytest.approx(255)
+    assert read(logs, fps=10, full_scale=white, response="log")[0].max() <= 255
+
+
 @pytest.mark.parametrize(("values", "code"), [
     (drifting(4) / 255, "EV003"), (drifting(4), "EV003"), (drifting(4) / 16, "EV003"),
     (drifting(4) * np.nan, "EV007"), (np.log(drifting(4)), "")])
