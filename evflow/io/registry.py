@@ -219,13 +219,13 @@ def write_recording(
     """
     need(recording, Recording, "recording", "For events: Recording.of_events(events).")
     with open_writer(path, recording.events.size, format, overwrite=overwrite,
-                     exposure_us=recording.exposure_us) as out:
+                     exposure_us=recording.exposure_us, full_scale=recording.full_scale) as out:
         copy(recording, out)
 
 
 def open_writer(
     path: str | os.PathLike, size: Size, format: str | None = None, *, overwrite: bool = False,
-    exposure_us: int = 0,
+    exposure_us: int = 0, full_scale: int = 0,
 ) -> EventWriter:
     """A writer for a recording that comes in parts; the file appears when the `with` block ends.
 
@@ -235,20 +235,22 @@ def open_writer(
         format: as in `write_recording`.
         overwrite: replace what exists.
         exposure_us: exposure time of the frames, 0 if it is unknown or there are none.
+        full_scale: DN of a saturated pixel of uint16 frames, as in `Recording`; 0 if it is unknown.
 
     Returns:
         A context manager with append(events) and append_frames(frames, frame_times).
 
     Raises:
-        EvflowDataError: EV003 (a larger sensor than the format holds), EV020 (size, format or
-            exposure); and from its block EV003, EV004 (order), EV010, EV013, EV015 (another size),
-            EV019.
+        EvflowDataError: EV003 (a larger sensor than the format holds), EV020 (size, format,
+            exposure or white); and from its block EV003, EV004 (order), EV010, EV013, EV015
+            (another size), EV019.
 
     Example:
         >>> with ef.open_writer("out.npz", (346, 260)) as out:
         ...     out.append(events)
     """
-    return writer_of(path, format)(path, size, overwrite=overwrite, exposure_us=exposure_us)
+    return writer_of(path, format)(
+        path, size, overwrite=overwrite, exposure_us=exposure_us, full_scale=full_scale)
 
 
 def writer_of(path: str | os.PathLike, format: str | None = None) -> type[EventWriter]:

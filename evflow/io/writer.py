@@ -20,7 +20,15 @@ from typing import ClassVar, TypeVar
 
 import numpy as np
 
-from evflow.checks import COLUMNS, Size, check_exposure, check_frames, check_size, check_times
+from evflow.checks import (
+    COLUMNS,
+    Size,
+    check_exposure,
+    check_frames,
+    check_full_scale,
+    check_size,
+    check_times,
+)
 from evflow.errors import EvflowDataError
 from evflow.files.atomic import atomic_write
 from evflow.files.spool import forget
@@ -45,7 +53,7 @@ class EventWriter(abc.ABC):
     NAME: the format. DEPTHS: dtypes of frames it can hold, () for none. MAX_SIDE: largest side of a
     sensor in pixels. TIMES_US: its first and last possible time. BEYOND: what to do about others.
     LABELS: whether it can label noise events. exposure_us: of the frames, stored with them; 0 =
-    unknown.
+    unknown. full_scale: the DN of white, stored with uint16 frames; 0 = unknown.
     """
 
     NAME: ClassVar[str]
@@ -57,10 +65,12 @@ class EventWriter(abc.ABC):
     LABELS: ClassVar[bool] = False
 
     def __init__(
-        self, path: str | os.PathLike, size: Size, *, overwrite: bool = False, exposure_us: int = 0
+        self, path: str | os.PathLike, size: Size, *, overwrite: bool = False,
+        exposure_us: int = 0, full_scale: int = 0,
     ) -> None:
         self.path, self.size, self.overwrite = Path(path), check_size(size), overwrite
         self.exposure_us = check_exposure(exposure_us)
+        self.full_scale = check_full_scale(full_scale)
         if max(self.size) > self.MAX_SIDE:
             raise EvflowDataError(
                 "EV003", f"{self.NAME} holds sensors of up to {self.MAX_SIDE} pixels a side, not "
@@ -164,6 +174,11 @@ class EventWriter(abc.ABC):
             part = slice(first, first + FRAMES)
             with self._guard():
                 self._write_frames(frames[part], times[part])
+
+    @property
+    def white(self) -> int:
+        """White as it is stored: that of uint16 frames, which do not show it; 0 for others."""
+        return self.full_scale if self._depth == np.uint16 else 0
 
     @classmethod
     def refuses(cls, depth: np.dtype) -> str:

@@ -116,19 +116,24 @@ def test_aedat4_by_the_aedat_package(tmp_path: Path) -> None:
         assert frame["format"] == "L"
 
 
-def test_where_an_exposure_is_written(tmp_path: Path) -> None:
-    want = dataclasses.replace(make(3000), exposure_us=4001)
+def test_where_exposure_and_white_are_written(tmp_path: Path) -> None:
+    made = make(3000)
+    want = dataclasses.replace(
+        made, frames=made.frames.astype(np.uint16), exposure_us=4001, full_scale=4095)
     for name, kind in (("a.h5", "dsec"), ("b.h5", "event_utils"), ("a.npz", "npz"),
                        ("folder", "evreal")):
         write_recording(tmp_path / name, want, kind)
     with h5py.File(tmp_path / "a.h5") as f:
         assert dict(f["frame_times"].attrs) == {"exposure_us": 4001}
+        assert dict(f["frames"].attrs) == {"full_scale": 4095}
     with h5py.File(tmp_path / "b.h5") as f:
-        assert {image.attrs["exposure_us"] for image in f["images"].values()} == {4001}
+        for name, value in (("exposure_us", 4001), ("full_scale", 4095)):
+            assert {image.attrs[name] for image in f["images"].values()} == {value}
     with np.load(tmp_path / "a.npz") as data:
         assert (data["exposure_us"].shape, int(data["exposure_us"])) == ((), 4001)
+        assert (data["full_scale"].shape, int(data["full_scale"])) == ((), 4095)
     assert json.loads((tmp_path / "folder/metadata.json").read_text()) == {
-        "sensor_resolution": [48, 64], "exposure_us": 4001}
+        "sensor_resolution": [48, 64], "exposure_us": 4001, "full_scale": 4095}
 
 
 def test_aedat4_s_exposure_by_the_aedat_package(tmp_path: Path) -> None:

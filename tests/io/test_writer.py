@@ -16,6 +16,7 @@ from helpers.recordings import SIZE, T0, equal, make
 
 from evflow.errors import EvflowDataError
 from evflow.io import open_writer, read_events, read_recording, write_events, write_recording
+from evflow.io.images.white import stated_white
 from evflow.io.registry import WRITERS, WRITTEN, find_format, writer_of
 from evflow.io.writer import EventWriter
 from evflow.types import Events, Recording
@@ -98,6 +99,35 @@ def test_without_frames_there_is_no_exposure(tmp_path: Path, kind: str) -> None:
     assert (found.exposure_us, found.notes) == (0, ())
     with pytest.raises(EvflowDataError, match="EV020"):
         open_writer(path, SIZE, kind, exposure_us=-1)
+
+
+@pytest.mark.parametrize("kind", [n for n in ANY if "uint16" in WRITERS[n].DEPTHS])
+@pytest.mark.parametrize("white", [4095, 1000])
+def test_white_of_16_bits_comes_back(tmp_path: Path, kind: str, white: int) -> None:
+    """Frames of a dark scene, or of a part, do not show it; bytes and floats have 255."""
+    path, made = place(tmp_path, kind), make(3000)
+    frames = np.linspace(0, 900, made.frames.size).astype(np.uint16).reshape(made.frames.shape)
+    want = Recording(made.events, frames, made.frame_times, full_scale=white)
+    write_recording(path, want, kind)
+    whole, part = read_recording(path), read_recording(path, stop_s=0.08)
+    assert len(part.frames) == 2
+    assert part.frames.max() < 400
+    assert whole.full_scale == part.full_scale == want.full_scale == max(white, 1023)
+    same(whole, want)
+    for dtype in (np.uint8, np.float32):
+        write_recording(path, Recording(
+            made.events, (frames // 4).astype(dtype), made.frame_times), kind, overwrite=True)
+        assert read_recording(path).full_scale == 255
+    with pytest.raises(EvflowDataError, match="EV020"):
+        open_writer(path, SIZE, kind, full_scale=-1)
+
+
+@pytest.mark.parametrize(("value", "white"), [
+    (4095, 4095), (np.uint16(4095), 4095), (np.array([4095]), 4095), (65536, 0), (-1, 0),
+    (10**30, 0), (True, 0), (4095.0, 0), ("4095", 0), (None, 0), ([[1], [1, 2]], 0),
+    (np.array([1, 2]), 0), (np.zeros(0, int), 0)])
+def test_what_is_no_white_states_none(value: Any, white: int) -> None:
+    assert stated_white(value) == white
 
 
 @pytest.mark.parametrize("kind", ["npz", "e2vid"])

@@ -68,11 +68,11 @@ def beside(
         elif array.dtype.kind == "b" and _shaped(array.shape) and _words(name) & ENCODED:
             streams.append(Images(ImageStream(
                 name, _size(array.shape), "bool, black and white only: save brightness, as uint8 "
-                "0 to 255"), lambda: (Stamps(np.zeros(0)), lambda part: ())))
+                "0 to 255"), lambda: Loaded(Stamps(np.zeros(0)), lambda part: ())))
         elif array.dtype.hasobject and _words(name) & ENCODED:
             streams.append(Images(ImageStream(
                 name, None, "of variable length, as encoded images are: save them as arrays, or as "
-                "files for --frames"), lambda: (Stamps(np.zeros(0)), lambda part: ())))
+                "files for --frames"), lambda: Loaded(Stamps(np.zeros(0)), lambda part: ())))
     try:
         return with_frames(path, found, hints, streams, "us", notes, events=events)
     except EvflowDataError as e:
@@ -162,8 +162,8 @@ def _loading(
         if unit == "auto" and (len(stamps.times) < 2 or np.isfinite(stamps.times).all()):
             unit = shared_unit(stamps.times, events.t, ["us", *UNITS_US]) or "auto"
         us, _, exposure_us, _ = to_us(stamps, f"{times} of {path}", unit)
-        return Stamps(us, stated_us=exposure_us, notes=stamps.notes), lambda part: map(
-            _seen, pixels(name, part))
+        return Loaded(Stamps(us, stated_us=exposure_us, notes=stamps.notes),
+                      lambda part: map(_seen, pixels(name, part)))
 
     return load
 

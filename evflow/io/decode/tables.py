@@ -24,6 +24,7 @@ from evflow.io.images.event_clock import beside_events
 from evflow.io.images.exposures import Stamps, stated_by
 from evflow.io.images.recorded import FrameStack, in_order
 from evflow.io.images.streams import ImageStream, choose, events_alone
+from evflow.io.images.white import WHITE, stated_white
 from evflow.notes import Note
 from evflow.types import Recording
 
@@ -149,12 +150,18 @@ def same_length(path: Path, columns: dict[str, Any]) -> int:
     return next(iter(lengths.values()))
 
 
-Loaded = tuple[Stamps, Callable[[slice], Iterable[np.ndarray]]]
+class Loaded(NamedTuple):
+    """stamps: of images as stored; decode(part): the images of a slice; full_scale: the DN of white
+    that the file states, 0 if it does not."""
+
+    stamps: Stamps
+    decode: Callable[[slice], Iterable[np.ndarray]]
+    full_scale: int = 0
 
 
 class Images(NamedTuple):
-    """Images of a file, decoded on demand. stream: what they are; load(): their stamps as stored,
-    and a function that decodes the images of a slice."""
+    """Images of a file, decoded on demand. stream: what they are; load(): what `Loaded`
+    says."""
 
     stream: ImageStream
     load: Callable[[], Loaded]
@@ -177,14 +184,14 @@ def with_frames(
     if chosen.stream is None:
         return Recording.of_events(stored, (*notes, *chosen.notes))
     with events_alone():
-        stamps, decode = next(i for i in several if i.stream is chosen.stream).load()
+        stamps, decode, white = next(i for i in several if i.stream is chosen.stream).load()
         times, added, exposure_us, _ = beside_events(
             stamps, path, native, hints, stored).believed()
         order, _ = in_order(times, hints)
         check_times(times if order is None else times[order], "frame times", strict=True)
         within = np.flatnonzero((times >= span[0]) & (times < span[1]))
         keep = slice(int(within[0]), int(within[-1]) + 1) if len(within) else slice(0)
-        stack = FrameStack(path, stored.size, hints.colour)
+        stack = FrameStack(path, stored.size, hints.colour, white)
         for image, time in zip(decode(keep), times[keep], strict=True) if len(within) else ():
             if span[0] <= time < span[1]:
                 stack.append(image, time, exposure_us=exposure_us)
@@ -205,12 +212,13 @@ def frame_size(data: Any) -> Size | None:
 
 def dataset_images(path: Path, group: Any, name: str, times: str) -> Images:
     """Frames in data set `name` of an HDF5 group, and their times in another; an attribute of
-    either may state their exposure."""
+    either may state their exposure, and one of the frames their white."""
     def load() -> Loaded:
         frames = dataset(path, group, name, (None, None, None), spooled=True)
         clock = dataset(path, group, times, (len(frames),))
         stamps = Stamps(clock[:], stated_us=stated_by(frames, clock))
-        return stamps, lambda keep: stored_frames(frames, keep)
+        return Loaded(stamps, lambda keep: stored_frames(frames, keep),
+                      stated_white(frames.attrs.get(WHITE)))
 
     whole = f"{group.name}/{name}".strip("/")
     return Images(ImageStream(whole, frame_size(group[name])), load)

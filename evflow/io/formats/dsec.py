@@ -4,8 +4,8 @@
 ms_to_idx[m] is the first with t >= 1000 m). evflow adds attributes width and height (absent in
 DSEC, which is always 640x480; its ms_to_idx and t_offset identify it), and /frames, /frame_times
 (i64 us, without t_offset; its attribute exposure_us is the frames' exposure, if known) if there are
-frames. `DsecWriter` takes events in chunks, so that a long simulation is never in memory as a
-whole.
+frames; the attribute full_scale of uint16 ones is their white. `DsecWriter` takes events in chunks,
+so that a long simulation is never in memory as a whole.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from evflow.io.decode.images_beside import are_images
 from evflow.io.decode.stream import Chunk, gather
 from evflow.io.hints import Hints
 from evflow.io.images.exposures import KEY
+from evflow.io.images.white import WHITE
 from evflow.notes import Note
 from evflow.types import Events, Recording
 
@@ -151,6 +152,8 @@ class DsecWriter(Hdf5Writer):
             self._create("frame_times", (), "i8", self.CHUNK)
             if self.exposure_us:
                 self._file["frame_times"].attrs[KEY] = np.int64(self.exposure_us)
+            if self.white:
+                self._file["frames"].attrs[WHITE] = np.int64(self.white)
         self._extend("frames", frames)
         self._extend("frame_times", times)
 

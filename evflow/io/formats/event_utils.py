@@ -25,6 +25,7 @@ from evflow.io.hints import Hints
 from evflow.io.images.exposures import KEY, Stamps, stated_by
 from evflow.io.images.numbers import natural
 from evflow.io.images.streams import ImageStream
+from evflow.io.images.white import WHITE, stated_white
 from evflow.io.writer import FLUSH, SECONDS_US
 from evflow.notes import Note
 from evflow.types import Events, Recording
@@ -58,7 +59,9 @@ def read(path: Path, hints: Hints) -> Recording:
             images = [_image(path, f["images"], name) for name in _names(f)]
             stamps = Stamps(np.array([_time(path, image) for image in images]),
                             stated_us=round(np.median([stated_by(image) for image in images])))
-            return stamps, lambda keep: (_pixels(image[:]) for image in images[keep])
+            return tables.Loaded(
+                stamps, lambda keep: (_pixels(image[:]) for image in images[keep]),
+                stated_white(images[0].attrs.get(WHITE)))
 
         images = tables.Images(ImageStream("images", seen), load)
         return tables.with_frames(path, found, hints, images, native, notes)
@@ -117,7 +120,7 @@ def _size(
 
 class EventUtilsWriter(Hdf5Writer):
     """xs, ys int16, as their loaders expect; ts float64 s; ps bool. Every image has `timestamp`,
-    `event_idx`, the last event before it, and `exposure_us` if it is known."""
+    `event_idx`, the last event before it, and `exposure_us` and `full_scale` if they are known."""
 
     NAME = NAME
     MAX_SIDE = 2**15
@@ -145,6 +148,8 @@ class EventUtilsWriter(Hdf5Writer):
             image.attrs.update(size=frame.shape, timestamp=second, type="greyscale")
             if self.exposure_us:
                 image.attrs[KEY] = np.int64(self.exposure_us)
+            if self.white:
+                image.attrs[WHITE] = np.int64(self.white)
             self._image_s.append(float(second))
             self._disk.check()
 

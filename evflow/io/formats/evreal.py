@@ -1,6 +1,7 @@
 """The folder of an EVREAL sequence (ercanburak/EVREAL): events_ts.npy (N,) s, events_xy.npy (N, 2),
 events_p.npy (N,); images.npy (T, H, W) or (T, H, W, 1 or 3), images_ts.npy (T,) s; metadata.json
-with sensor_resolution = (height, width), to which evflow adds exposure_us if it is known.
+with sensor_resolution = (height, width), to which evflow adds exposure_us if it is known, and
+full_scale (white) of uint16 images.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from evflow.io.decode.stream import gather
 from evflow.io.hints import Hints
 from evflow.io.images.exposures import KEY, Stamps, stated
 from evflow.io.images.streams import ImageStream
+from evflow.io.images.white import WHITE, stated_white
 from evflow.io.writer import SECONDS_US, EventWriter
 from evflow.types import Events, Recording
 
@@ -53,7 +55,9 @@ def read(path: Path, hints: Hints) -> Recording:
     def load() -> tables.Loaded:
         images = _images(path)
         stamps = np.asarray(mapped(path / "images_ts.npy", (len(images),)))
-        return Stamps(stamps, stated_us=_exposure(path)), lambda keep: map(np.array, images[keep])
+        exposure_us, white = _stated(path)
+        return tables.Loaded(Stamps(stamps, stated_us=exposure_us),
+                             lambda keep: map(np.array, images[keep]), white)
 
     images = tables.Images(ImageStream(IMAGES, seen), load)
     return tables.with_frames(path, found, hints, images, _unit(ts))
@@ -101,15 +105,17 @@ def _declared_size(path: Path) -> Size | None:
             where=file) from e
 
 
-def _exposure(path: Path) -> int:
-    """The exposure of the images in us from metadata.json, 0 if it does not state one."""
+def _stated(path: Path) -> tuple[int, int]:
+    """The exposure of the images in us and their white from metadata.json, 0 for what it does not
+    state."""
     file = path / METADATA
     if not is_there(file) or file.stat().st_size > 1 << 20:
-        return 0
+        return 0, 0
     with contextlib.suppress(ValueError):
         held = parse_json(file.read_text("utf-8"))
-        return stated(held, held.__getitem__) if isinstance(held, dict) else 0
-    return 0
+        if isinstance(held, dict):
+            return stated(held, held.__getitem__), stated_white(held.get(WHITE))
+    return 0, 0
 
 
 class EvrealWriter(EventWriter):
@@ -165,4 +171,6 @@ class EvrealWriter(EventWriter):
         facts: dict[str, Any] = {"sensor_resolution": self.size[::-1]}
         if "images" in self._arrays and self.exposure_us:
             facts[KEY] = self.exposure_us
+        if self.white:
+            facts[WHITE] = self.white
         write_checked(self._folder / METADATA, json.dumps(facts) + "\n")

@@ -110,7 +110,8 @@ def _read(path: Path, root: Root, name: str, hints: Hints) -> Recording:
 
     def load() -> tables.Loaded:
         seconds, names = _read_index(root / IMAGES)
-        return Stamps(seconds), lambda keep: (_image(root, n) for n in names[keep])
+        return tables.Loaded(
+            Stamps(seconds), lambda keep: (_image(root, n) for n in names[keep]))
 
     images = tables.Images(ImageStream(IMAGES, seen), load)
     return tables.with_frames(path, found, hints, images, "s", layout.notes, (CLOCK,))

@@ -1,7 +1,7 @@
 """evflow's own .npz: t (int64 us), x, y, p, size = (width, height), and optionally frames,
-frame_times and exposure_us. Other names of these (`decode.columns`) and a single array of records
-or N x 4 numbers (`decode.arrays`) are read too. Pickles are never loaded: members that are not
-needed may be Python objects, and a note names them.
+frame_times, exposure_us and full_scale (white of uint16 frames). Other names of these
+(`decode.columns`) and a single array of records or N x 4 numbers (`decode.arrays`) are read too.
+Pickles are never loaded: members that are not needed may be Python objects, and a note names them.
 
 Members are checked against the bytes that the archive really holds before memory is allocated, and
 columns are decompressed in parallel, in blocks.
@@ -35,6 +35,7 @@ from evflow.io.images.event_clock import beside_events
 from evflow.io.images.exposures import KEY, exposed_note
 from evflow.io.images.recorded import cut, in_order
 from evflow.io.images.streams import ImageStream, choose, events_alone
+from evflow.io.images.white import WHITE, stated_white
 from evflow.io.writer import EventWriter
 from evflow.notes import Note
 from evflow.types import Events, Recording
@@ -170,7 +171,14 @@ def _with_frames(
             frames, times = frames[order], times[order]
         said = (exposed_note(exposure_us),) if exposure_us else ()
         notes = (*notes, *more, *late, *said)
-        return cut(Recording(events, frames, times, notes, exposure_us), span)
+        return cut(Recording(events, frames, times, notes, exposure_us, _white(found)), span)
+
+
+def _white(found: dict[str, Member]) -> int:
+    """The DN of white of uint16 frames that the file states, 0 if it does not."""
+    member, deep = found.get(WHITE), found["frames"].dtype == np.uint16
+    return stated_white(member.whole()) if member and deep and member.shape in ((), (1,)) and (
+        member.dtype.kind in "iu") else 0
 
 
 def _events(
@@ -250,10 +258,12 @@ class NpzWriter(EventWriter):
                 shutil.copyfileobj(f, member, BLOCK)
         with self._archive.open("size.npy", "w") as f:
             np.lib.format.write_array(f, np.array(self.size, np.int32))
-        if "frames" in self._columns and self.exposure_us:
-            self._sizes[f"{KEY}.npy"] = None
-            with self._archive.open(f"{KEY}.npy", "w") as f:
-                np.lib.format.write_array(f, np.array(self.exposure_us, np.int64))
+        stated = {KEY: self.exposure_us, WHITE: self.white} if "frames" in self._columns else {}
+        for name, number in stated.items():
+            if number:
+                self._sizes[f"{name}.npy"] = None
+                with self._archive.open(f"{name}.npy", "w") as f:
+                    np.lib.format.write_array(f, np.array(number, np.int64))
 
     def _verify(self, temporary: Path) -> None:
         need_members(temporary, self._sizes)

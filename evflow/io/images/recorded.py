@@ -24,11 +24,14 @@ class FrameStack:
 
     where: names their file in messages; size: (width, height) of the sensor: images of another
     size, such as a region of it, are left out and counted. seen: what pixels see, as
-    `Hints.colour`.
+    `Hints.colour`. full_scale: the DN of white if the file states it, used for 16 bits; else 0.
     """
 
-    def __init__(self, where: object, size: Size, seen: str = "luma") -> None:
+    def __init__(
+        self, where: object, size: Size, seen: str = "luma", full_scale: int = 0
+    ) -> None:
         self.where, self.size, self.seen, self.colour = where, size, seen, False
+        self.full_scale = full_scale
         self.times: list[int] = []
         self.exposures: list[int] = []
         self.left: collections.Counter[str] = collections.Counter()
@@ -90,7 +93,8 @@ class FrameStack:
         more = (*more, *doubted)
         if exposure_us:
             more = (*more, exposed_note(exposure_us))
-        return Recording(events, frames, times, (*notes, *more), exposure_us)
+        white = self.full_scale if frames.dtype == np.uint16 else 0
+        return Recording(events, frames, times, (*notes, *more), exposure_us, white)
 
 
 def in_order(times: np.ndarray, hints: Hints) -> tuple[np.ndarray | None, tuple[Note, ...]]:
