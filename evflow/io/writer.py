@@ -53,7 +53,7 @@ class EventWriter(abc.ABC):
     NAME: the format. DEPTHS: dtypes of frames it can hold, () for none. MAX_SIDE: largest side of a
     sensor in pixels. TIMES_US: its first and last possible time. BEYOND: what to do about others.
     LABELS: whether it can label noise events. exposure_us: of the frames, stored with them; 0 =
-    unknown. full_scale: the DN of white, stored with uint16 frames; 0 = unknown.
+    unknown. full_scale: the DN of white of uint16 frames, stored with them; 0 = unknown.
     """
 
     NAME: ClassVar[str]
@@ -177,8 +177,10 @@ class EventWriter(abc.ABC):
 
     @property
     def white(self) -> int:
-        """White as it is stored: that of uint16 frames, which do not show it; 0 for others."""
-        return self.full_scale if self._depth == np.uint16 else 0
+        """White as it is stored with uint16 and float32 frames, which do not show it; 0 for uint8.
+        Float32 frames are in DN: dark ones would be taken for fractions of white."""
+        return {np.dtype(np.uint16): self.full_scale, np.dtype(np.float32): 255}.get(
+            np.dtype(self._depth), 0)
 
     @classmethod
     def refuses(cls, depth: np.dtype) -> str:

@@ -374,3 +374,14 @@ def test_the_extension_tells_the_format(tmp_path: Path) -> None:
         open_writer(tmp_path / "a.h5", (0, 5))
     with pytest.raises(EvflowDataError, match=r"EV020.*path is of type NoneType"):
         write_events(None, events)
+
+
+@pytest.mark.parametrize("kind", ["npz", "dsec", "event_utils", "evreal"])
+def test_a_dark_part_of_float_frames_is_read_as_it_was_written(tmp_path: Path, kind: str) -> None:
+    made = make(2000)
+    frames = np.full((len(made.frame_times), *made.events.size[::-1]), 90, np.float32)
+    frames[-2:] = 0.4
+    write_recording(tmp_path / "a", Recording(made.events, frames, made.frame_times), kind)
+    begin = 1e-6 * float(made.frame_times[-2] - made.events.t[0]) - 1e-5
+    part = read_recording(tmp_path / "a", start_s=begin)
+    np.testing.assert_array_equal(part.frames, frames[-2:])

@@ -4,8 +4,8 @@
 ms_to_idx[m] is the first with t >= 1000 m). evflow adds attributes width and height (absent in
 DSEC, which is always 640x480; its ms_to_idx and t_offset identify it), and /frames, /frame_times
 (i64 us, without t_offset; its attribute exposure_us is the frames' exposure, if known) if there are
-frames; the attribute full_scale of uint16 ones is their white. `DsecWriter` takes events in chunks,
-so that a long simulation is never in memory as a whole.
+frames; the attribute full_scale of uint16 and float32 ones is their white. `DsecWriter` takes
+events in chunks, so that a long simulation is never in memory as a whole.
 """
 
 from __future__ import annotations

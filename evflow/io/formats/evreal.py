@@ -1,7 +1,7 @@
 """The folder of an EVREAL sequence (ercanburak/EVREAL): events_ts.npy (N,) s, events_xy.npy (N, 2),
 events_p.npy (N,); images.npy (T, H, W) or (T, H, W, 1 or 3), images_ts.npy (T,) s; metadata.json
 with sensor_resolution = (height, width), to which evflow adds exposure_us if it is known, and
-full_scale (white) of uint16 images.
+full_scale (white) of uint16 and float32 images.
 """
 
 from __future__ import annotations

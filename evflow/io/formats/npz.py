@@ -1,5 +1,5 @@
 """evflow's own .npz: t (int64 us), x, y, p, size = (width, height), and optionally frames,
-frame_times, exposure_us and full_scale (white of uint16 frames). Other names of these
+frame_times, exposure_us and full_scale (white of uint16 and float32 frames). Other names of these
 (`decode.columns`) and a single array of records or N x 4 numbers (`decode.arrays`) are read too.
 Pickles are never loaded: members that are not needed may be Python objects, and a note names them.
 
@@ -175,8 +175,8 @@ def _with_frames(
 
 
 def _white(found: dict[str, Member]) -> int:
-    """The DN of white of uint16 frames that the file states, 0 if it does not."""
-    member, deep = found.get(WHITE), found["frames"].dtype == np.uint16
+    """The DN of white of uint16 or float32 frames that the file states, 0 if it does not."""
+    member, deep = found.get(WHITE), found["frames"].dtype in (np.uint16, np.float32)
     return stated_white(member.whole()) if member and deep and member.shape in ((), (1,)) and (
         member.dtype.kind in "iu") else 0
 

@@ -24,7 +24,7 @@ class FrameStack:
 
     where: names their file in messages; size: (width, height) of the sensor: images of another
     size, such as a region of it, are left out and counted. seen: what pixels see, as
-    `Hints.colour`. full_scale: the DN of white if the file states it, used for 16 bits; else 0.
+    `Hints.colour`. full_scale: the DN of white if the file states it; else 0.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class FrameStack:
         more = (*more, *doubted)
         if exposure_us:
             more = (*more, exposed_note(exposure_us))
-        white = self.full_scale if frames.dtype == np.uint16 else 0
+        white = self.full_scale if frames.dtype != np.uint8 else 0
         return Recording(events, frames, times, (*notes, *more), exposure_us, white)
 
 

@@ -1,7 +1,7 @@
-"""White of 16-bit frames, where a file states it under the name by which evflow writes it.
+"""White of 16-bit and float frames, where a file states it under the name that evflow gives it.
 
 The frames of a part, or of a dark scene, do not show it: they would be taken for those of a smaller
-converter, four times too bright.
+converter, four times too bright, or for fractions of white.
 """
 
 from __future__ import annotations
