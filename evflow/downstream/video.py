@@ -82,7 +82,8 @@ def with_reconstructed_frames(
         if progress:
             progress(i + 1, len(times))
     note = Note("frames.made", f"{len(frames)} frames were {MADE} {name}")
-    return Recording(recording.events, frames, times[warm_up:], (*recording.notes, note))
+    return Recording(recording.events, frames, times[warm_up:], (*recording.notes, note),
+                     full_scale=255)
 
 
 def doubted(found: CameraEstimate) -> CameraEstimate:
