@@ -96,6 +96,7 @@ NOTES: dict[str, str] = {
     "pixels.lost": "pixels lose contrast in their dead time",
     "pixels.slow": "the photoreceptor's low-pass was measured",
     "pixels.unsure": "most pixels have no events of their own",
+    "noise.assumed": "that noise falls with light is assumed",
     "noise.drift": "light that drifts causes events that are not counted as noise",
     "noise.even": "the noise rate does not fall with intensity",
     "windows.beyond": "events come before the first frame or after the last",

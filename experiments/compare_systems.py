@@ -90,10 +90,9 @@ def main(options: Options) -> dict[str, Any]:
         for name in REAL:
             try:
                 recording = read_recording(options.data / name)
+                result["real"][name] = held_out(params, recording, systems)
             except EvflowDataError as error:
                 print(f"{name} left out: {error}")
-                continue
-            result["real"][name] = held_out(params, recording, systems)
     text = table(result)
     print(text)
     config = dataclasses.asdict(options) | {"systems": {k: repr(v) for k, v in systems.items()}}

@@ -31,7 +31,7 @@ from experiments.shared.many import Setup
 from experiments.shared.real_cameras import draw_exposed, draw_other, draw_real, draw_single
 from experiments.shared.refinement import COVERED, begun
 from experiments.shared.rows import collected
-from experiments.shared.weight_parts import begin_fit, save_part
+from experiments.shared.weight_parts import begin_fit, save_part, seeds_before
 
 KINDS = (draw_protocol,) * 5 + (draw_real,) * 5 + (draw_single,) * 5 + (draw_other,) * 2
 # Of so many one has another shape and scene, which would tell the kind of camera: those of 64x64
@@ -48,7 +48,7 @@ class Options:
     out: Path
     recordings: int = 6000
     steps: int = 1000
-    """Of each network; 200 are enough with --continued."""
+    """Of each network; 600 are enough with --continued."""
     continued: bool = False
     """Begin from the fusion that the weights have, at a lower rate, not anew."""
     workers: int = 1
@@ -95,6 +95,7 @@ def main(options: Options) -> dict[str, Any]:
     at_least(FOLDS, recordings=options.recordings)
     name, net = begin_fit(options, "summary", *(["fusion"] if options.continued else []))
     start = net["fusion"] if options.continued else None
+    before = seeds_before(options, "fusion") if options.continued else []
     protocols = [drawn(options.seed, i) for i in range(options.recordings)]
     setup = Setup(str(options.weights), options.seed, photos=True)
     origin = f"{options.seed} {weights_hash(options.weights)}"
@@ -107,7 +108,7 @@ def main(options: Options) -> dict[str, Any]:
               "widen": jnp.asarray(widen, jnp.float32)}
     print("\n".join(f"{k:24s} {v:.4f}" for k, v in figures.items()))
     save_part(options, name, net, {"fusion": fusion}, {"fusion": {
-        "recordings": options.recordings, "seed": options.seed, "figures": figures}})
+        "recordings": options.recordings, "seeds": [*before, options.seed], "figures": figures}})
     return figures
 
 

@@ -13,7 +13,7 @@ from evflow.checks import require
 
 def is_off(value: Any) -> bool:
     """Whether a number is known to be 0: a traced one may have any value."""
-    return isinstance(value, int | float) and value == 0
+    return isinstance(value, int | float | np.number) and value == 0
 
 
 def settle(config: Any, name: str, low: float, rule: str) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
-import math
 import shlex
 import sys
 import time
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from evflow.commands.light import check_light
 from evflow.commands.options import (
     Compiling,
     Reading,
@@ -26,7 +26,7 @@ from evflow.commands.options import (
 )
 from evflow.commands.packages import need_packages
 from evflow.commands.writing import need_apart, need_folder
-from evflow.errors import EvflowDataError
+from evflow.errors import EvflowDataError, naming
 from evflow.notes import as_dicts
 
 if TYPE_CHECKING:
@@ -157,7 +157,7 @@ class Estimate(Compiling, Reading):
                    self.thresholds, self.triggers, self.frames, self.timestamps)
         if self.budget_s is not None and self.budget_s < 0:
             raise EvflowDataError("EV020", f"--budget-s {self.budget_s:g}.", "It must be >= 0.")
-        self._check_light()
+        check_light(self.lux, 1 + len(self.more), self.protocol)
         if self.protocol != "motion":
             refuse(self, ("weights", "window_ms", "reconstruct", *READ),
                    "only useful with --protocol motion")
@@ -168,24 +168,6 @@ class Estimate(Compiling, Reading):
         for name, protocol in (("thresholds", "static"), ("triggers", "step")):
             if self.protocol != protocol:
                 refuse(self, (name,), f"only useful with --protocol {protocol}")
-
-    def _check_light(self) -> None:
-        """Raise EV020 if --lux or a second recording does not fit the protocol."""
-        count = 1 + len(self.more)
-        if (self.more and self.protocol != "static") or (self.lux and self.protocol == "motion"):
-            raise EvflowDataError(
-                "EV020", f"{'--lux' if not self.more else f'{count} recordings'} with --protocol "
-                f"{self.protocol}.",
-                "Noise against illuminance needs --protocol static and one --lux per recording"
-                f"{', or --protocol step with a single recording' if not self.more else ''}.")
-        if not all(0 < v < math.inf for v in self.lux):
-            raise EvflowDataError("EV020", f"--lux {' '.join(f'{v:g}' for v in self.lux)}.",
-                                  "Give numbers > 0.")
-        if self.protocol == "static" and (self.more or self.lux) and len(self.lux) != count:
-            raise EvflowDataError(
-                "EV020", f"{len(self.lux)} values of --lux for {count} recording"
-                f"{'s' if self.more else ''}.", "Give one for each, in the same order: evflow "
-                "estimate A B --protocol static --lux 5 200.")
 
     def _recorded(self, path: Path) -> tuple[Recording, Report, list[Note]]:
         """A recording, the findings of `evflow check`, and its doubts; raises its errors."""
@@ -200,7 +182,7 @@ class Estimate(Compiling, Reading):
             with on_disk(SOME):
                 recording = self.read(path)
             progress(0, 1, "checking")
-            report = check(recording)
+            report = check(recording, min_window_us=round(self.window_ms * 1000))
         print_notes(recording, beside=report)
         # Between the steps of a light frames may be early or late by much of a rest.
         spared = ("EV024",) if self.protocol == "step" else ()
@@ -272,12 +254,22 @@ class Estimate(Compiling, Reading):
             return Measured(calibrate_step(recording, lux=self.lux, triggers_us=triggers)), {}
         found = estimate_noise(recording, lux=self.lux[0] if self.lux else None)
         if self.more:
-            others = [estimate_noise(self._recorded(path)[0], lux=lux)
-                      for path, lux in zip(self.more, self.lux[1:], strict=True)]
-            found = noise_over_light([found, *others])
+            others = [self._noise(*of) for of in zip(self.more, self.lux[1:], strict=True)]
+            found = noise_over_light([found, *(other for other, _ in others)])
+            found = dataclasses.replace(found, notes=(*found.notes, *(
+                doubt for _, doubts in others for doubt in doubts)))
         facts = {"recordings": [str(p) for p in (self.recording, *self.more)]} if self.more else {}
         found = with_thresholds(found, self.thresholds) if self.thresholds else found
         return Measured(found), facts
+
+    def _noise(self, path: Path, lux: float) -> tuple[CameraEstimate, list[Note]]:
+        """The noise of a further recording, and its doubts, which name it."""
+        from evflow.estimation.static import estimate_noise
+
+        with naming(path):
+            recording, _, doubts = self._recorded(path)
+            return estimate_noise(recording, lux=lux), [
+                dataclasses.replace(doubt, text=f"{path}: {doubt.text}") for doubt in doubts]
 
     def _report(
         self, out: Path, found: CameraEstimate, recording: Recording, first: FirstPart | None,

@@ -42,10 +42,11 @@ class Export:
         need_absent(self.out, self.overwrite, self.camera)
         known = read_summary(self.camera)
         sensor, optics = read_sensor(self.camera)
+        undetermined = read_undetermined(self.camera)
         export, maps = export_camera(
-            camera, self.to, std, sensor, known[0] if known else None, optics)
+            camera, self.to, std, sensor, known[0] if known else None, optics, undetermined)
         write_export(self.out, export, maps, overwrite=self.overwrite)
-        warn_of_prior(read_undetermined(self.camera), "exported")
+        warn_of_prior(undetermined, "exported")
         files = [*sorted([*export.scripts, *export.arrays]), "maps.npz", "README.txt"]
         facts = {"out": str(self.out), "to": self.to, "files": files, "text": export.text}
         print(json.dumps(facts) if self.json else

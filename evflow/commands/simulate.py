@@ -89,7 +89,7 @@ class Simulate(Pixels, Footage, Compiling):
         need_absent(self.out, self.overwrite, self.video, self.camera, self.timestamps)
         self._check(io.registry.writer_of(self.out, format))
         source = self.source(self.video)
-        if not (self.interpolate and self.max_motion_px):  # the blur is left in
+        if not self._fills:  # the blur is left in
             source.notes[:] = noted(source.notes, 0)
         keep()
         early.settle()
@@ -153,10 +153,15 @@ class Simulate(Pixels, Footage, Compiling):
             raise
         return f"{described}, {slow:.3g} times slower than life" if slow > 1 else described
 
+    @property
+    def _fills(self) -> bool:
+        """Whether frames are put between those of the video; saccades move in small steps."""
+        return self.interpolate and self.max_motion_px > 0 and self.saccades is None
+
     def _blur_notes(self, source: FrameSource) -> list[Note]:
         """What the measured camera's estimate saw of an exposure that nobody tells here."""
         seen_ms = self.exposure_seen_ms(source.recorded)
-        if not seen_ms or source.exposure_us or self.exposure_ms is not None:
+        if not (seen_ms and self._fills) or source.exposure_us or self.exposure_ms is not None:
             return []
         return [Note("frames.blur", f"frames may be blurred: those that {self.camera} was measured "
                      f"from looked exposed for {seen_ms:.0f} ms. If these are of that recording, "
@@ -165,9 +170,9 @@ class Simulate(Pixels, Footage, Compiling):
     def _check(self, writer: type[EventWriter]) -> None:
         """Raise EV013, EV020 before any long work."""
         if not self.interpolate:
-            refuse(self, ("max_motion_px", "exposure_ms"), "--no-interpolate adds no frames")
-        if self.saccades is not None:
-            refuse(self, ("exposure_ms",), "a single picture has none")
+            refuse(self, ("max_motion_px",), "--no-interpolate adds no frames")
+        if not self._fills:
+            refuse(self, ("exposure_ms",), "blur is taken out where frames are put between others")
         if self.labels and not writer.LABELS:
             refuse(self, ("labels",), f"{writer.NAME} cannot store them; dsec (.h5) and npz can")
         if self.preview is None:
@@ -189,8 +194,7 @@ class Simulate(Pixels, Footage, Compiling):
         from evflow.simulator.interpolate import upsample
         from evflow.simulator.photoreceptor import seen_frames
 
-        fills = self.interpolate and self.saccades is None  # saccades move in small steps
-        limit = self.max_motion_px if fills else 0.0
+        limit = self.max_motion_px if self._fills else 0.0
         video, came, shown_us = source.watched(shown), deque[Pair](), deque[int]()
         if self.frames_too:
             video = _kept(video, self.colour, came)

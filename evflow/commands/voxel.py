@@ -114,7 +114,8 @@ def _windows(
         need_few_windows(t, window_us)
         starts = np.arange(t[0], t[-1] + 2 - window_us, window_us)
         pairs, lengths = (), np.full(len(starts), window_us)
-        notes = (Note("frames.none", "no frames: windows of equal length, without dlogI."),)
+        notes = (Note("frames.none", f"{'one frame' if recording.has_frames else 'no frames'}: "
+                      "windows of equal length, without dlogI."),)
     if not len(starts):
         why = ("; ".join(map(str, notes[:3])) or "the frames span less than that"
                if recording.has_frames else f"the events span {(t[-1] - t[0]) / 1e3:g} ms")

@@ -130,9 +130,19 @@ def lost_notes(lost: Lost | None, as_sent: Summary, summary: Summary) -> list[No
         "(OFF) higher.")]
 
 
+EVEN_NOISE = Note(
+    "noise.even", "the noise does not fall with light as v2e's shot noise does: simulations have "
+    "the same noise at any light.")
+ASSUMED = Note(
+    "noise.assumed", "that noise falls with light, as v2e's shot noise does, is assumed: the light "
+    "on quiet pixels differs too little, or their events are too few, to show it. If it does not, "
+    "there is no shot noise, and simulations of other light have too much or too little noise.")
+
+
 def noise_notes(shot: Shot) -> list[Note]:
-    return [Note("noise.even", "the noise does not fall with light as v2e's shot noise does: "
-                 "simulations have the same noise at any light.")] if shot.even else []
+    if shot.even:
+        return [EVEN_NOISE]
+    return [ASSUMED] if shot.hz and not shot.falls else []
 
 
 def drift_notes(per_second: np.ndarray, by_drift: np.ndarray) -> list[Note]:

@@ -18,7 +18,7 @@ from evflow.estimation.bench.levels import Bench, Level
 from evflow.estimation.intervals import waits_at_rest
 from evflow.estimation.leak import Leak, measured_leak
 from evflow.estimation.pixel_noise import pixel_rates
-from evflow.estimation.remarks import dead_notes, noise_notes
+from evflow.estimation.remarks import ASSUMED, EVEN_NOISE, dead_notes, noise_notes
 from evflow.estimation.result import THRESHOLDS, CameraEstimate
 from evflow.estimation.shot import Shot, by_light, measured_noise, measured_shot, scatter
 from evflow.notes import Note, why_no_frames
@@ -31,6 +31,7 @@ from evflow.types import Events, Recording
 
 MOSTLY = 0.8  # share of the time that is observed beside several gaps
 LONG_S = 1.0  # and time beside one, as of a clock that jumps: a flash is shorter
+APART, FALL = 4.0, 0.1  # ratio of lights at which noise that falls with light falls by more
 
 
 def estimate_noise(
@@ -114,14 +115,30 @@ def _kinds(
 
 def noise_over_light(found: Sequence[CameraEstimate]) -> CameraEstimate:
     """The first of several estimates of one camera's noise, each with its lux; `.bench` has the
-    levels of all. EV015 if their sizes differ."""
+    levels of all, and there is no shot noise where these show that noise does not fall with light.
+    EV015 if their sizes differ."""
     sizes = {f.camera.shape for f in found}
     if len(sizes) > 1:
         raise EvflowDataError("EV015", f"recordings of cameras of different sizes: {sizes}.",
                               "Noise against illuminance needs recordings of one camera.")
-    levels = [level for f in found if f.bench for level in f.bench.levels]
+    levels = sorted((level for f in found if f.bench for level in f.bench.levels),
+                    key=lambda level: level.light)
+    first = dataclasses.replace(found[0], bench=Bench("lux", tuple(levels)))
+    if not (first.sensor.shot_hz and _even(levels[0], levels[-1], first.sensor.leak_hz)):
+        return first
     return dataclasses.replace(
-        found[0], bench=Bench("lux", tuple(sorted(levels, key=lambda v: v.light))))
+        first, sensor=dataclasses.replace(first.sensor, shot_hz=0.0),
+        sensor_std={**first.sensor_std, "shot_hz": float("nan")},
+        notes=(*(note for note in first.notes if note != ASSUMED), EVEN_NOISE))
+
+
+def _even(dark: Level, bright: Level, leak_hz: float) -> bool:
+    """Whether there is as much noise other than leak in bright light as in the dark."""
+    rate_dark, rate_bright = (max(v.eta_on + v.eta_off - leak_hz, 1e-9) for v in (dark, bright))
+    errors = [np.hypot(v.eta_on_std, v.eta_off_std) for v in (dark, bright)]
+    error = float(np.hypot(errors[0] / rate_dark, errors[1] / rate_bright))
+    falls_by = float(np.log(rate_dark / rate_bright)) + 2.0 * error
+    return bright.light > APART * dark.light and falls_by < FALL
 
 
 def uniform(bounds: tuple[float, float]) -> tuple[float, float]:

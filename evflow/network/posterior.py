@@ -76,7 +76,8 @@ def posterior(found: Evidence, y6: Array, y6_std: Array) -> tuple[Camera, Camera
     slope = jnp.concatenate([jnp.ones_like(theta), _rates(y_eta)], -1)
     shared = y6_std[..., :4] * per_channel(SCALE, v) * jnp.concatenate(
         [theta, jnp.ones_like(theta)], -1)
-    std = slope * jnp.sqrt(width**2 + shared**2)
+    # Pixels that are all alike, of a known camera, have no error: the gradient there is 0.
+    std = slope * jnp.sqrt(jnp.maximum(width**2 + shared**2, 1e-30))
     return camera, Camera(*jnp.moveaxis(std, -1, 0))
 
 

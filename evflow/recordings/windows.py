@@ -255,9 +255,10 @@ def check_overlap(recording: Recording) -> None:
         raise EvflowDataError("EV001", "the recording has no events.")
     if len(times) < 2:
         raise EvflowDataError(
-            "EV011", f"the recording has {len(times)} frames{why_no_frames(recording.notes)}; a "
-            "window lies between two.",
-            "Thresholds are measured against intensity: record or add frames.")
+            "EV011", f"the recording has {'one frame' if len(times) else 'no frames'}"
+            f"{why_no_frames(recording.notes)}; a window lies between two.",
+            "Thresholds are measured against intensity: record or add frames. Of a static scene "
+            "noise is measured without: --protocol static.")
     start, stop = covered_us(recording)
     if times[-1] <= start or times[0] >= stop:
         large = too_large(times, t)

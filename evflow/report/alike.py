@@ -29,7 +29,8 @@ def judge_streams(numbers: dict[str, Any]) -> list[Judged]:
         swapped = Judged(
             "poor", "", 9.0, "ON and OFF are swapped in one of them: net events of small areas "
             f"and times anti-correlate (r = {net:.2f}).",
-            advice="Read one of them with --polarity invert, and compare again.")
+            advice="Write one of them again with ON and OFF swapped (evflow convert IN OUT "
+            "--polarity invert), and compare that.")
         # What else differs may follow from it: other advice would be about the wrong polarity.
         return [swapped, *(dataclasses.replace(j, advice="") for j in judged + _times(numbers))]
     return judged + _times(numbers)

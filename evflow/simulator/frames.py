@@ -47,7 +47,8 @@ def blocks(
         taken = list(itertools.islice(pairs, length))
     if count < 2:
         raise EvflowDataError("EV001", "the video has one frame.",
-                              "Events need a change: give at least two frames.")
+                              "Events need a change: give at least two frames (of a part, "
+                              "--start and --stop, a longer one).")
 
 
 def _flat(frame: np.ndarray, copy: bool, full_scale: float | None) -> np.ndarray:

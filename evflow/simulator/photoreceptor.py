@@ -16,12 +16,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
+from evflow.camera.numbers import is_off
 from evflow.camera.optics import Optics
 from evflow.camera.sensors import LogMap, SensorModel
 from evflow.light.log_maps import lin_log_inverse, log_dn, log_dn_inverse, to_log
@@ -48,14 +50,13 @@ class Photoreceptor:
 
     @staticmethod
     def of(sensor: SensorModel, optics: Optics) -> Photoreceptor:
-        tau_s = 1.0 / (2.0 * np.pi * sensor.cutoff_hz) if sensor.cutoff_hz > 0 else 0.0
-        return Photoreceptor(optics.offset_dn, tau_s, optics.delay_s, sensor.cutoff_by_light,
-                             sensor.log_map)
+        return Photoreceptor(optics.offset_dn, _time_constant(sensor.cutoff_hz), optics.delay_s,
+                             sensor.cutoff_by_light, sensor.log_map)
 
     @property
     def ideal(self) -> bool:
-        """Whether the pixel sees the light of the frames, without delay."""
-        return not (self.offset_dn or self.tau_s or self.delay_s)
+        """Whether the pixel is known to see the light of the frames, without delay."""
+        return all(is_off(v) for v in (self.offset_dn, self.tau_s, self.delay_s))
 
     @property
     def logarithmic(self) -> bool:
@@ -74,6 +75,14 @@ class Photoreceptor:
 
 
 IDEAL = Photoreceptor()
+
+
+def _time_constant(cutoff_hz: Any) -> Any:
+    """Seconds; 0 for a cutoff of 0, which is no low-pass. A traced one may have any value."""
+    if isinstance(cutoff_hz, float):
+        return 1.0 / (2.0 * np.pi * cutoff_hz) if cutoff_hz > 0 else 0.0
+    on = jnp.asarray(cutoff_hz) > 0
+    return jnp.where(on, 1.0 / (2.0 * np.pi * jnp.where(on, cutoff_hz, 1.0)), 0.0)
 
 
 def as_measured(sensor: SensorModel, optics: Optics) -> tuple[Photoreceptor, SensorModel]:
@@ -124,9 +133,11 @@ def seen_log(
     if seen_by.ideal:
         return to_log(frames, behind.log_map), behind
     how = offset_dn, seen_by.tau_s, seen_by.by_light, seen_by.logarithmic
-    s = (seen_path(frames, jnp.full(len(frames) - 1, dt_s), *how) if seen_by.tau_s
-         else _light(frames, *how)[0])
-    darker = np.float32(np.log1p(max(offset_dn, 0.0) / 255.0))
+    s = _light(frames, *how)[0]
+    if not is_off(seen_by.tau_s):  # a traced one may be 0
+        low_passed = seen_path(frames, jnp.full(len(frames) - 1, dt_s), *how)
+        s = jnp.where(seen_by.tau_s > 0, low_passed, s)
+    darker = jnp.log1p(jnp.maximum(offset_dn, 0.0) / 255.0)
     return to_log(_shown(s, darker, seen_by.logarithmic), behind.log_map), behind
 
 

@@ -95,8 +95,8 @@ def train(
     if lost:
         raise _diverged(lost, checkpoints.latest)
     reached = int(state.step)
-    stopped = (f"stopped after step {reached} of {config.steps}; a checkpoint is saved, and the "
-               "same command goes on.")
+    again = "--resume auto goes on" if options.resume == "never" else "the same command goes on"
+    stopped = f"stopped after step {reached} of {config.steps}; a checkpoint is saved, and {again}."
     by_signal = agree(bool(requests))
     if not by_signal and reached < config.steps and is_main():
         print(f"--max-seconds {options.max_seconds:g}: {stopped}", file=sys.stderr)

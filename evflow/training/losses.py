@@ -74,12 +74,15 @@ def gradient(image: Array) -> Array:
     return jnp.sqrt(down**2 + right**2 + 1e-12)
 
 
-def event_loss(generated: Array, voxels: Array, strength: Array, config: LossConfig) -> Array:
+def event_loss(
+    generated: Array, voxels: Array, strength: Array, expected: Array, config: LossConfig
+) -> Array:
     """L_E (Eq. 9), (..., h, w, 2B) -> (...), averaged over patches and summed over scales.
 
     generated: asinh of the generated voxels; voxels: the true ones; strength: of edges, (..., h,
-    w). At moving edges voxels are compared (Charbonnier, on asinh as counts span three decades, or
-    on ELU); elsewhere only events per patch and polarity, with the variance of a Poisson count.
+    w); expected: approximate number of events, as in `rate_loss`. At moving edges voxels are
+    compared (Charbonnier, on asinh as counts span three decades, or on ELU); elsewhere only events
+    per patch and polarity, with the variance of a Poisson count.
     """
     events = linear(generated)
     if config.elu:
@@ -91,8 +94,9 @@ def event_loss(generated: Array, voxels: Array, strength: Array, config: LossCon
     for size in config.patches:
         moving = edge_weight(strength, size, config.edge)
         values = _patches(error, size).mean((-3, -2, -1))
-        made = _counts(events, size)
-        noise = dispersion(made, _counts(voxels, size), jax.nn.relu(made) + 1.0).mean(-1) / size**2
+        variance = _counts(expected, size) + 1.0
+        noise = dispersion(_counts(events, size), _counts(voxels, size), variance).mean(-1)
+        noise = noise / size**2
         total += (moving * values + (1.0 - moving) * noise).mean(-1)
     return total
 

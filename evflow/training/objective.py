@@ -179,12 +179,13 @@ def _flow_losses(
 
 def _event_loss(generated: Array, block: Block, config: LossConfig) -> Array:
     """L_E of each block, (B,)."""
+    expected = _expected(block)
     if config.events == "rate":
-        return losses.rate_loss(generated, block.voxels, _expected(block), config.patches)
+        return losses.rate_loss(generated, block.voxels, expected, config.patches)
     # Mean log intensity of the two frames, about the middle.
     strength = (block.changes.sum(-1) if config.edges == "change"
                 else losses.gradient(block.context[..., 1]))
-    return losses.event_loss(generated, block.voxels, strength, config)
+    return losses.event_loss(generated, block.voxels, strength, expected, config)
 
 
 def _expected(block: Block) -> Array:

@@ -96,9 +96,9 @@ def bank_of(config: TrainConfig, photos: bool) -> TextureBank:
 
 
 def _headline(figures: Metrics) -> str:
-    """The error of both thresholds; before there is any, 0."""
-    theta = [figures.get(f"summary/theta_{p}", 0.0) for p in ("on", "off")]
-    return f"theta {sum(theta) / 2:.4f}"
+    """The error of both thresholds, or the loss where no summary is trained; 0 before any."""
+    theta = [figures[name] for p in ("on", "off") if (name := f"summary/theta_{p}") in figures]
+    return f"theta {sum(theta) / 2:.4f}" if theta else f"loss {figures.get('loss', 0.0):.4f}"
 
 
 def configuration(options: TrainOptions, devices: int) -> TrainConfig:

@@ -84,7 +84,8 @@ def all_scores(setup: Setup, systems: dict[str, System], protocol: tuple[str, Pr
                 yield score(*one, {n: s for n, s in systems.items() if i < s.most_recordings})
         enough([None] * seen, count)
 
-    of = [weights_hash(setup.weights), setup.seed, *map(repr, systems.values())]
+    of = [weights_hash(setup.weights), weights_hash("paper"), setup.seed,
+          *map(repr, systems.values())]
     return resumed(path, of, [f"{name}, {i}" for i in range(count)], scored, f"mismatch {name}")
 
 

@@ -42,10 +42,10 @@ def halves(recording: Recording) -> tuple[Recording, Recording]:
     cuts = (min(times[0], events.t[0]), times[middle], max(times[-1], events.t[-1]))
     first, second = (events.slice(int(a) + late, int(b) + 1)
                      for a, b, late in ((cuts[0], cuts[1], 0), (cuts[1], cuts[2], 1)))
-    exposure_us = recording.exposure_us
-    return (Recording(first, recording.frames[:middle + 1], times[:middle + 1],
-                      exposure_us=exposure_us),
-            Recording(second, recording.frames[middle:], times[middle:], exposure_us=exposure_us))
+    return (dataclasses.replace(recording, events=first, frames=recording.frames[:middle + 1],
+                                frame_times=times[:middle + 1]),
+            dataclasses.replace(recording, events=second, frames=recording.frames[middle:],
+                                frame_times=times[middle:]))
 
 
 def calibrated_and_scored(case: Case, held_out: bool) -> tuple[Recording, Case, str]:

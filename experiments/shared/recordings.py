@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -50,5 +51,6 @@ def cut(recording: Recording, span_s: tuple[float, float] | None) -> Recording:
         return recording
     begin, end = (int(recording.frame_times[0] + 1e6 * s) for s in span_s)
     first, last = np.searchsorted(recording.frame_times, [begin, end])
-    return Recording(recording.events.slice(begin, end), recording.frames[first:last],
-                     recording.frame_times[first:last], exposure_us=recording.exposure_us)
+    return dataclasses.replace(
+        recording, events=recording.events.slice(begin, end),
+        frames=recording.frames[first:last], frame_times=recording.frame_times[first:last])

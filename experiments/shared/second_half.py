@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import time
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 from evflow import Recording
 from evflow.baselines import System
 from evflow.baselines.base import intervals, usable
+from evflow.errors import EvflowDataError
 from experiments.shared.compared import POLARITIES
 from experiments.shared.fits import all_fits
 
@@ -21,13 +23,17 @@ SMOOTH = 1.0  # pixels: frames and counts are blurred alike, against noise and m
 
 def halves(recording: Recording) -> tuple[Recording, Recording]:
     """The usable part of a recording before and from its middle frame on: they share that frame
-    and no event."""
+    and no event. EV017 if there are too few."""
     found, events = usable(recording), recording.events
+    if len(found) < 2:
+        raise EvflowDataError("EV017", f"{len(found)} usable interval between frames.",
+                              "Two halves need two: record longer.")
     cuts = [found[0], found[(len(found) + 1) // 2], found[-1] + 1]
     times = recording.frame_times
     first, second = (
-        Recording(events.slice(int(times[a]), int(times[b])), recording.frames[a:b + 1],
-                  times[a:b + 1], exposure_us=recording.exposure_us)
+        dataclasses.replace(
+            recording, events=events.slice(int(times[a]), int(times[b])),
+            frames=recording.frames[a:b + 1], frame_times=times[a:b + 1])
         for a, b in itertools.pairwise(cuts))
     return first, second
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from evflow.commands.writing import need_absent, need_suffix
+from evflow.errors import EvflowDataError
 from evflow.network.weights import model_card, save_weights
 from experiments.shared.common import at_least, estimator
 
@@ -31,6 +32,19 @@ def begin_fit(options: FitOptions, *parts: str) -> tuple[str, dict[str, Any]]:
     need_suffix(options.out, ".safetensors")
     need_absent(options.out, options.overwrite)
     return estimator(options.weights, *parts)
+
+
+def seeds_before(options: FitOptions, part: str) -> list[int]:
+    """Seeds of the recordings that this part of the weights has learnt from. Raises EV020 where
+    `options.seed` is one of them: cross-validation would judge it by what it has seen."""
+    card = model_card(options.weights).get(part, {})
+    seeds = card.get("seeds", [card["seed"]] if "seed" in card else [])
+    if options.seed in seeds:
+        raise EvflowDataError(
+            "EV020", f"the {part} of {options.weights} has learnt from recordings of seed "
+            f"{options.seed} before.", "Give another --seed, so that its errors are those on "
+            "cameras it has not seen.")
+    return seeds
 
 
 def save_part(

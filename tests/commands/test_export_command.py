@@ -50,6 +50,14 @@ def test_light_that_frames_do_not_show_is_told(to: str) -> None:
 
 
 @pytest.mark.parametrize("to", list(TARGETS))
+def test_a_prior_is_not_called_measured(to: str, tmp_path: Path) -> None:
+    none, known = (export_camera(Camera.constant((4, 6)), to, undetermined=names)[0].text
+                   for names in ((), ("theta_on", "theta_off")))
+    assert known.startswith("NOT MEASURED: theta_on and theta_off")
+    assert known.endswith(none)
+
+
+@pytest.mark.parametrize("to", list(TARGETS))
 def test_v2e_is_told_that_its_logarithm_is_another(to: str) -> None:
     told = [export_camera(Camera.constant((4, 6)), to, sensor=SensorModel(log_map=log_map))[0].text
             for log_map in ("linlog", "log_eps")]

@@ -70,6 +70,7 @@ def test_options_without_effect_are_told(folder: Path, capsys: pytest.CaptureFix
     "simulate flight.npz -o a.h5 --bayer rggb --colour rggb",
     "simulate flight.npz -o a.h5 --exposure-ms -1", "estimate flight.npz -o a --exposure-ms -1",
     "simulate flight.npz -o a.h5 --exposure-ms 9 --no-interpolate",
+    "simulate flight.npz -o a.h5 --exposure-ms 9 --max-motion-px 0",
     "simulate flight.npz -o a.h5 --exposure-ms 2e4", "estimate flight.npz -o a --exposure-ms 2e4",
     "simulate flight.npz -o a.h5 --exposure-ms inf",
     "simulate flight.npz -o a.h5 --start nan", "info flight.npz --timestamps-unit us",

@@ -13,7 +13,7 @@ from evflow.estimation.intervals import EDGES, QuietWaits, life_table, waits_at_
 from evflow.estimation.leak import measured_leak
 from evflow.estimation.pixel_noise import calm, quiet_time
 from evflow.estimation.shot import at_mean_light, by_light, measured_shot, scatter
-from evflow.estimation.static import estimate_noise
+from evflow.estimation.static import estimate_noise, noise_over_light
 
 SHAPE = (48, 64)
 NONE_HOT = np.zeros(SHAPE, bool)
@@ -205,3 +205,27 @@ def test_frames_that_begin_long_before_the_events_are_no_time_at_rest() -> None:
     assert early.sensor.leak_hz == pytest.approx(found.sensor.leak_hz, rel=0.01)
     with pytest.raises(EvflowDataError, match="EV012"):
         estimate_noise(Recording(events, frames, times + 1_700_000_000_000_000))
+
+
+@pytest.mark.parametrize("falls", [True, False])
+def test_levels_of_light_tell_whether_noise_falls_with_it(falls: bool) -> None:
+    """Of one uniform level nothing tells, and a note says so."""
+    found, times = [], 250_000 * np.arange(41)
+    for number, (dn, lux) in enumerate(((25, 5.0), (100, 80.0), (220, 1500.0))):
+        model = SensorModel(shot_hz=1.0 if falls else 0.0, noise_resets_memory=True)
+        frames = np.full((41, *SHAPE), dn, np.uint8)
+        rate = 0.0 if falls else 0.2
+        events = simulate(jax.random.key(number), frames, times,
+                          Camera.constant(SHAPE, 0.2, 0.2, rate, rate), model=model)
+        found.append(estimate_noise(Recording(events, frames, times), lux=lux))
+        assert found[-1].sensor.shot_hz > 0
+        assert "noise.assumed" in [note.code for note in found[-1].notes]
+    together = noise_over_light(found[::-1])
+    codes = [note.code for note in together.notes]
+    if falls:
+        assert together.sensor.shot_hz == pytest.approx(1.0, rel=0.1)
+    else:
+        assert together.sensor.shot_hz == 0
+        assert np.isnan(together.sensor_std["shot_hz"])
+        assert "noise.even" in codes
+    assert ("noise.assumed" in codes) == falls

@@ -19,7 +19,7 @@ from evflow import Recording
 from evflow.errors import EvflowDataError
 from evflow.io import write_recording
 from evflow.network.config import MODELS
-from evflow.network.weights import load_weights, save_weights
+from evflow.network.weights import load_weights, model_card, save_weights
 from evflow.training.checkpoint import Checkpoints
 from evflow.training.run import started_from
 from evflow.types import Events
@@ -98,6 +98,14 @@ def test_two_lengths_of_a_recording(tmp_path: Path) -> None:
 def test_fits_of_too_little(script: Any, given: dict[str, int], tmp_path: Path) -> None:
     with pytest.raises(EvflowDataError, match=rf"EV020.*--{next(iter(given))}"):
         script.main(script.Options("default", out=tmp_path / "made.safetensors", **given))
+
+
+def test_fusions_that_have_seen_the_recordings(tmp_path: Path) -> None:
+    seen = model_card("default")["fusion"]["seeds"]
+    assert len(seen) > 1
+    given = fuse.Options("default", out=tmp_path / "a.safetensors", continued=True, seed=seen[0])
+    with pytest.raises(EvflowDataError, match=rf"EV020.*of seed {seen[0]} before"):
+        fuse.main(given)
 
 
 @pytest.mark.parametrize("script", [fuse, tell_apart, template, coverage, evaluate, true_video],

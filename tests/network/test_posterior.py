@@ -60,3 +60,13 @@ def test_a_hot_pixel_stays_hot() -> None:
     camera, _ = posterior(evidence(y, jnp.full((2, 4), 0.6)), y6[None], jnp.zeros((1, 6)))
     assert float(camera.eta_on[0]) > 20
     assert float(camera.eta_on[1]) == pytest.approx(0.1 * 1.2**0.2, rel=0.01)
+
+
+def test_of_a_camera_whose_pixels_are_alike_gradients_are_numbers() -> None:
+    def width(sigma: jax.Array) -> jax.Array:
+        values = (jnp.float32(v) for v in (0.2, 0.3, 0.1, 0.2))
+        y6 = unsquash_summary(Summary(*values, sigma, sigma))
+        said = Evidence(jnp.ones((1, 4)), jnp.ones((1, 4)))
+        return posterior(said, y6[None], jnp.zeros((1, 6)))[1].theta_on.sum()
+
+    assert np.isfinite(jax.jit(jax.grad(width))(jnp.float32(0.0)))

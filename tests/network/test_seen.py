@@ -130,3 +130,17 @@ def test_brightness_must_be_known() -> None:
     code = api.code_from_video(params, changes, CAMERA, intensity=some, sensor=SLOW)
     assert np.isfinite(code.changes).all()
     assert not np.asarray(code.context)[:, :3, 1:].any()
+
+
+def test_circuits_may_be_traced() -> None:
+    """A sample of each of many cameras: 0 is no low-pass."""
+    params, (changes, intensity) = small_params(), light(pattern())
+
+    def seen(cutoff_hz: Any) -> Any:
+        return api.code_from_video(
+            params, changes, CAMERA, window_s=WINDOW_S, intensity=intensity,
+            sensor=SensorModel(cutoff_hz=cutoff_hz)).changes
+
+    given = jnp.array([20.0, 300.0, 0.0])
+    alone = [seen(hz) for hz in given.tolist()]
+    np.testing.assert_allclose(jax.jit(jax.vmap(seen))(given), alone, atol=5e-3)

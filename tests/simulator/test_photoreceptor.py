@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import jax
 import numpy as np
 import pytest
 
@@ -87,3 +90,17 @@ def test_on_the_device_frames_are_seen_as_on_the_host(
     np.testing.assert_allclose(made, wanted, atol=2e-5)
     assert circuit == behind
     assert not circuit.cutoff_hz
+
+
+def test_traced_numbers_are_those_that_are_known() -> None:
+    frames = np.random.default_rng(0).uniform(20, 200, (6, 4, 4)).astype(np.float32)
+
+    def seen(cutoff_hz: Any, offset_dn: Any) -> Any:
+        return seen_log(frames, 1e-3, SensorModel(cutoff_hz=cutoff_hz), offset_dn)[0]
+
+    given = np.array([[30.0, 0.0], [0.0, 0.0], [80.0, 12.0], [0.0, 5.0]])
+    alone = [seen(*pair) for pair in given.tolist()]
+    np.testing.assert_allclose(jax.vmap(seen)(*given.T), alone, atol=1e-5)
+    slope = jax.grad(lambda c, o: seen(c, o)[-1].sum(), (0, 1))
+    np.testing.assert_allclose(jax.jit(slope)(60.0, 3.0), slope(60.0, 3.0), rtol=1e-4)
+    assert np.isfinite(jax.jit(slope)(0.0, 0.0)).all()

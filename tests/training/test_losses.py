@@ -52,12 +52,28 @@ def test_event_loss_sees_edges_and_noise() -> None:
     moving, still = np.full((8, 8), np.float32(0.5)), np.zeros((8, 8), np.float32)
     config, small = LossConfig(patches=(4, 8), edge=0.1), LossConfig(patches=(4,), edge=0.1)
     for dL in (moving, still):
-        assert float(event_loss(exact, voxels, dL, config)) < 3e-3
-        assert float(event_loss(exact + 0.5, voxels, dL, config)) > 0.02
+        assert float(event_loss(exact, voxels, dL, voxels, config)) < 3e-3
+        assert float(event_loss(exact + 0.5, voxels, dL, voxels, config)) > 0.02
     # In a still patch only the number of events counts: shuffled in time costs nothing.
     shuffled = np.arcsinh(np.concatenate([voxels[..., 15::-1], voxels[..., :15:-1]], -1))
-    assert float(event_loss(shuffled, voxels, still, small)) < 1e-5
-    assert float(event_loss(shuffled, voxels, moving, small)) > 0.1
+    assert float(event_loss(shuffled, voxels, still, voxels, small)) < 1e-5
+    assert float(event_loss(shuffled, voxels, moving, voxels, small)) > 0.1
+
+
+def test_in_still_patches_as_many_events_as_expected_are_wanted() -> None:
+    """Though the count that is made scatters by the latents' noise."""
+    rng, shape = np.random.default_rng(0), (4000, 4, 4, 2)
+    true = rng.poisson(0.16, shape).astype(np.float32)
+    noise = 0.6 * rng.standard_normal(shape, np.float32)  # 2.4 of a patch's 2.6 events
+    expected, still = np.full(shape, np.float32(0.16)), np.zeros(shape[:-1], np.float32)
+    config = LossConfig(patches=(4,), edge=0.1)
+
+    def loss(scale: jax.Array) -> jax.Array:
+        made = jnp.arcsinh(scale * expected + noise)
+        return losses.event_loss(made, true, still, expected, config).mean()
+
+    slopes = jax.jit(jax.vmap(jax.grad(loss)))(jnp.linspace(0.8, 1.2, 41))
+    assert float(np.linspace(0.8, 1.2, 41)[np.argmin(np.abs(slopes))]) == pytest.approx(1, abs=0.03)
 
 
 def test_elu_lets_counts_below_none_cost_little() -> None:
@@ -67,7 +83,7 @@ def test_elu_lets_counts_below_none_cost_little() -> None:
     def loss(made: float, true: np.ndarray = voxels) -> float:
         generated = np.arcsinh(np.full(true.shape, np.float32(made)))
         return float(event_loss(
-            generated, true, moving, LossConfig(patches=(4,), edge=0.1, elu=True)))
+            generated, true, moving, true, LossConfig(patches=(4,), edge=0.1, elu=True)))
 
     assert loss(3.0) == pytest.approx(1e-3, rel=1e-3)
     assert loss(5.0) == pytest.approx(2.0, rel=1e-3)
@@ -88,7 +104,7 @@ def test_a_gradient_of_the_image_is_an_edge() -> None:
 def test_event_loss_survives_wild_flows() -> None:
     voxels = jnp.zeros((4, 4, 32))
     grad = jax.jit(jax.grad(lambda g: losses.event_loss(
-        g, voxels, voxels[..., 0], LossConfig(patches=(4,)))))
+        g, voxels, voxels[..., 0], voxels, LossConfig(patches=(4,)))))
     assert np.isfinite(grad(jnp.full((4, 4, 32), 200.0))).all()
 
 

@@ -163,7 +163,7 @@ class Settings:
         if none was measured."""
         if not self.shot_hz:
             return ""
-        return (f"- Shot noise was measured: {self.shot_hz:.3f} Hz in the dark (ON and OFF "
+        return (f"- The camera has shot noise: {self.shot_hz:.3f} Hz in the dark (ON and OFF "
                 "together), a quarter\n  of it in the brightest pixels. Here noise has one rate in "
                 "any light: its dependence on light is\n  lost.\n")
 

@@ -72,10 +72,13 @@ What IEBCS cannot represent
   rate of each pixel, but IEBCS assigns them to its pixels at random: the distribution of rates is
   kept, the locations are not. Rates are quantised to its bins, 1 to 9 times a power of ten; a
   silent pixel fires once in 1000 s. A noise event stores the present intensity.
-{light_lost}{dead}\
+{light_lost}{dead}{upright}\
 - Latency, time constant and jitter (lat, tau, jit) are those of IEBCS's examples, and so is the
   dead time (ref, microseconds) if none was measured (here: {circuit}). Its latency is no low-pass.
 - The log map is log(I + 1) with white at 1e4; {refers_to}.
+'''
+UPRIGHT = '''- Sensors that are higher than wide: it looks the noise of a pixel up at
+  row * height + column, beyond the last one (IndexError). Turn video and maps by 90 degrees.
 '''
 
 
@@ -86,7 +89,7 @@ def export(maps: Maps, s: Settings) -> Export:
     values = vars(s) | rates | {
         "light": LIGHT + SWITCH, "srgb": SRGB, "same_size": s.same_size, "sigma": s.sigma,
         "refers_to": s.refers_to, "circuit": s.circuit, "dead": s.begun_anew,
-        "light_lost": s.light_lost,
+        "light_lost": s.light_lost, "upright": UPRIGHT if s.height > s.width else "",
         "dead_us": round(s.dead_s * 1e6) or USUAL_DEAD_US}
     arrays = {"noise_pos.npy": spectrum(maps["eta_on"]), "noise_neg.npy": spectrum(maps["eta_off"])}
     return Export(TEXT.format(**values), {"run_iebcs.py": SCRIPT.format(**values)}, arrays)

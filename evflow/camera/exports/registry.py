@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -26,11 +26,13 @@ TARGETS: Mapping[str, Callable[[Maps, Settings], Export]] = {
 def export_camera(
     camera: Camera, to: str, std: Camera | None = None, sensor: SensorModel = SensorModel(),
     summary: Mapping[str, float] | None = None, optics: Optics = Optics(),
+    undetermined: Sequence[str] = (),
 ) -> tuple[Export, Maps]:
     """A camera of maps (H, W) as the settings of a simulator, with the maps as float32. std: that
     of an estimate's maps, which are smoother than the camera; sensor: its measured circuit;
     summary: the estimate's summary (`read_summary`), by default computed from the maps; optics: how
-    the light on the pixels differs from what the frames show.
+    the light on the pixels differs from what the frames show; undetermined: maps that are a
+    prior's, not measured.
 
     Raises EV020 (no such simulator), EV002 (several cameras at once).
     """
@@ -43,7 +45,14 @@ def export_camera(
                     if c is not None else None for c in (camera, std))
     assert maps is not None
     export = TARGETS[to](maps, Settings.of(maps, errors, sensor, summary))
-    return dataclasses.replace(export, text=export.text + _light(optics)), maps
+    text = _unmeasured(undetermined) + export.text + _light(optics)
+    return dataclasses.replace(export, text=text), maps
+
+
+def _unmeasured(names: Sequence[str]) -> str:
+    """A paragraph about values that are a prior's; "" without any."""
+    return (f"NOT MEASURED: {' and '.join(names)}, with their spread. They are a prior's,\n"
+            "whatever is said of them below and in the scripts.\n\n") if names else ""
 
 
 def _light(optics: Optics) -> str:

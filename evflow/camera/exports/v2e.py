@@ -105,8 +105,9 @@ def export(maps: Maps, s: Settings) -> Export:
                  f"leak was {measured}")
     elif leak:
         right = (f"it is right at 128 DN for the OFF noise (measured {s.eta_off:.4f}\n  Hz); what "
-                 f"ON has more of it ({s.eta_on:.4f} Hz) is leak, a regular drift. --leak_rate_hz\n"
-                 "  is higher than that difference, as every shot noise event takes the drift back")
+                 f"ON has more of it ({more:.4f} Hz) is leak, a regular drift"
+                 + (". --leak_rate_hz\n  is higher than that difference, as every shot noise event "
+                    "takes the drift back" if both else ""))
     else:
         right = f"it is right at 128 DN for the mean of both (measured\n  {measured})"
     values = vars(s) | {

@@ -33,7 +33,7 @@ def drifting(steps: Steps) -> Finding | None:
     fps = 1e6 / steps.interval_us
     return Finding(
         "EV024", "error" if (here < LOST * best).mean() > 0.5 else "warning",
-        f"the frames' times run {abs(slope):.1%} too {'fast' if slope > 0 else 'slow'}: they are "
+        f"the frames' times run {abs(slope):.1%} too {'slow' if slope > 0 else 'fast'}: they are "
         f"{-offsets[0] / 1e3:+.0f} ms off around {(times[0] - steps.events.t[0]) / 1e6:.2f} s and "
         f"{-offsets[-1] / 1e3:+.0f} ms around {(times[-1] - steps.events.t[0]) / 1e6:.2f} s.",
         f"Were they made from a nominal rate? Pass the camera's own (--timestamps), or a rate of "

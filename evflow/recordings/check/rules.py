@@ -17,12 +17,13 @@ from evflow.recordings.check.contents import contents, repeated
 from evflow.recordings.check.findings import Finding, Report
 from evflow.recordings.check.images import images
 from evflow.recordings.stillness import stands_still
-from evflow.recordings.windows import check_overlap, iter_windows
+from evflow.recordings.windows import MIN_US, check_overlap, iter_windows
 from evflow.types import Recording, release
 
 
 def check(
-    recording_or_path: Recording | str | os.PathLike, **hints: Unpack[HintArguments]
+    recording_or_path: Recording | str | os.PathLike, *, min_window_us: int = MIN_US,
+    **hints: Unpack[HintArguments],
 ) -> Report:
     """Look for common faults of a recording before any estimate.
 
@@ -39,6 +40,7 @@ def check(
 
     Args:
         recording_or_path: the recording, or a file or folder in any known format.
+        min_window_us: shortest window that an estimate will use, microseconds.
         **hints: for the reader of a path, as in `read_recording`.
 
     Returns:
@@ -58,10 +60,10 @@ def check(
             recording_or_path = io.read_recording(Path(recording_or_path), **hints)
         except EvflowDataError as error:
             return Report((Finding.of(error),))
-    return Report(tuple(_findings(recording_or_path)))
+    return Report(tuple(_findings(recording_or_path, min_window_us)))
 
 
-def _findings(recording: Recording) -> list[Finding]:
+def _findings(recording: Recording, min_window_us: int) -> list[Finding]:
     found = contents(recording)
     if not len(recording.events):
         return found
@@ -71,14 +73,17 @@ def _findings(recording: Recording) -> list[Finding]:
         found += [*flickers(recording), *capped(recording), *repeated(recording.events)]
     found += images(recording)
     if recording.has_frames and timed:
-        try:
-            check_overlap(recording)
-        except EvflowDataError as error:
-            return [*found, Finding.of(error)]
-        found += bunches(recording)
-        if not stands_still(recording):  # noise alone rightly agrees with nothing
+        # Noise alone rightly agrees with nothing, and needs no window between two frames.
+        still = stands_still(recording)
+        if not (still and len(recording.frame_times) == 1):
             try:
-                iter_windows(recording)
+                check_overlap(recording)
+            except EvflowDataError as error:
+                return [*found, Finding.of(error)]
+        found += bunches(recording)
+        if not still:
+            try:
+                iter_windows(recording, min_window_us)
             except EvflowDataError as error:
                 found.append(Finding.of(error))
             release(recording)

@@ -351,6 +351,19 @@ def test_noise_and_thresholds_join_in_one_camera(
     assert "EV020" in capsys.readouterr().err
 
 
+def test_doubts_of_further_recordings_are_kept(tmp_path: Path) -> None:
+    from evflow.cli import main
+
+    for name, off_hz in (("a", 0.5), ("b", 0.0)):
+        write_recording(tmp_path / f"{name}.npz", Recording.of_events(
+            bench(Camera.constant(SHAPE, 0.2, 0.25, 1.0, off_hz), [100] * 20).events))
+    both, out = [str(tmp_path / f"{name}.npz") for name in "ab"], tmp_path / "out"
+    assert main(["estimate", *both, "--protocol", "static", "--lux", "5", "200", "--no-plots",
+                 "--no-checks", "-o", str(out)]) == 0
+    notes = json.loads((out / "camera.json").read_text())["notes"]
+    assert [n["code"] for n in notes if n["text"].startswith(both[1])] == ["EV022"]
+
+
 def test_triggers_and_light_of_each_rest_take_the_place_of_frames() -> None:
     """With both edges of a pulse at each step, and one after the events."""
     camera = cameras(0.05)

@@ -246,6 +246,17 @@ def test_events_that_begin_at_the_end_leave_no_window(sound: Recording) -> None:
     assert "EV017" in [f.code for f in found.errors]
 
 
+def test_windows_are_those_of_the_estimate(sound: Recording) -> None:
+    """Two frames 20 ms apart are enough for windows of 20 ms."""
+    begin = int(sound.frame_times[2])
+    two = dataclasses.replace(
+        sound, events=sound.events.slice(begin, begin + 20_000), frames=sound.frames[2:4],
+        frame_times=np.array([begin, begin + 20_000]))
+    found = [[f.code for f in check(two, min_window_us=us).errors] for us in (40_000, 20_000)]
+    assert "EV017" in found[0]
+    assert "EV017" not in found[1]
+
+
 def test_saturated_black_and_repeated_frames(sound: Recording) -> None:
     bright = np.clip(sound.frames.astype(int) * 4, 0, 255).astype(np.uint8)
     assert "EV027" in codes(dataclasses.replace(sound, frames=bright))

@@ -15,6 +15,7 @@ from evflow import Events, Recording, check, estimate_camera, read_recording
 from evflow.errors import EvflowDataError
 from evflow.estimation.static import estimate_noise
 from evflow.notes import Note
+from evflow.recordings.gaps import event_gaps
 from evflow.recordings.stillness import clustered, coincidence_excess, stands_still
 
 SIZE = (64, 48)
@@ -54,6 +55,29 @@ def test_rates_of_a_static_scene_are_found() -> None:
         alone = recording.events.count_map()[i] / SECONDS
         own = np.abs(alone - rates[i])[~hot].mean()
         assert np.abs(estimate - rates[i])[~hot].mean() < 0.95 * own
+
+
+def test_one_frame_is_enough() -> None:
+    recording = static()[0]
+    frame = np.full((1, SIZE[1], SIZE[0]), 90, np.uint8)
+    one = dataclasses.replace(recording, frames=frame, frame_times=np.array([5_000_000]))
+    assert not check(one).errors
+    moving = dataclasses.replace(one, events=dataclasses.replace(
+        one.events, x=np.sort(one.events.x), y=np.sort(one.events.y)))
+    error = check(moving).errors[0]
+    assert error.code == "EV011"
+    assert "one frame;" in error.seen
+    assert "--protocol static" in error.fix
+
+
+def test_the_time_between_bursts_is_no_gap() -> None:
+    """As of steps of light: most events come in bursts, between which a small sensor is slow."""
+    rng = np.random.default_rng(0)
+    bursts = np.concatenate([rng.uniform(s, s + 20_000, 2000) for s in np.arange(24) * 300_000])
+    rest = rng.uniform(0, 24 * 300_000, 24 * 60)
+    t = np.sort(np.concatenate([bursts, rest]).astype(np.int64))
+    assert not len(event_gaps(t))
+    assert len(event_gaps(np.concatenate([t, t + t[-1] + 3_000_000]))) == 1
 
 
 def test_thresholds_are_said_to_be_undetermined() -> None:
