@@ -26,7 +26,7 @@ def halves(recording: Recording) -> tuple[Recording, Recording]:
     and no event. EV017 if there are too few."""
     found, events = usable(recording), recording.events
     if len(found) < 2:
-        raise EvflowDataError("EV017", f"{len(found)} usable interval between frames.",
+        raise EvflowDataError("EV017", f"{len(found) or 'no'} usable interval between frames.",
                               "Two halves need two: record longer.")
     cuts = [found[0], found[(len(found) + 1) // 2], found[-1] + 1]
     times = recording.frame_times
