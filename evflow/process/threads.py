@@ -2,14 +2,14 @@
 
 For steps that release the GIL: OpenCV, XLA, HDF5. Order and results are those of one thread.
 Signals reach the main thread only, at any point, so the queues are of a kind that a signal cannot
-leave locked, and each block ends its thread.
+leave locked, and each block ends its thread, also one whose start was interrupted.
 """
 
 from __future__ import annotations
 
+import _thread
 import contextlib
 import sys
-import threading
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from queue import SimpleQueue
@@ -50,14 +50,19 @@ def ahead(items: Iterable[T], depth: int) -> Iterator[Iterator[T]]:
         if one is not None:
             raise one
 
-    thread = threading.Thread(target=make, daemon=True)
-    try:
-        thread.start()
-        yield read()
-    finally:
+    def end() -> None:
+        nonlocal stopped
         stopped = True
         room.put(None)
-        thread.join()
+        maker.end()
+
+    maker = _Worker(make)
+    try:
+        maker.start()
+        yield read()
+        end()
+    finally:
+        end()
 
 
 @contextlib.contextmanager
@@ -85,18 +90,18 @@ def behind(depth: int) -> Iterator[Callable[..., None]]:
             raise failed[0]
         calls.put(partial(do, *arguments))
 
-    thread = threading.Thread(target=work, daemon=True)
+    worker = _Worker(work)
     try:
-        thread.start()
+        worker.start()
         yield later
         calls.put(None)
-        thread.join()
+        worker.wait()
     except BaseException:
         dropped = True
         raise
     finally:
         calls.put(None)
-        thread.join()
+        worker.end()
     if failed:
         raise failed[0]
 
@@ -125,6 +130,40 @@ def beside(steps: int) -> Iterator[None]:
         yield
     finally:
         cv2.setNumThreads(before)
+
+
+class _Worker:
+    """A thread that a signal can interrupt at any point of its start and end. `threading.Thread` is
+    not one: in `start`, a signal may leave its lock taken or released twice, and `join` raises if
+    the start was interrupted."""
+
+    def __init__(self, work: Callable[[], None]) -> None:
+        self._work = work
+        self._begun = self._cancelled = self._ended = False
+        self._woken: SimpleQueue[None] = SimpleQueue()
+
+    def start(self) -> None:
+        _thread.start_new_thread(self._run, ())
+
+    def wait(self) -> None:
+        """Until the work has ended."""
+        while not self._ended:  # a signal may take what wakes, but not the state
+            self._woken.get()
+
+    def end(self) -> None:
+        """As wait; but work that has not begun never will."""
+        self._cancelled = True
+        if self._begun:
+            self.wait()
+
+    def _run(self) -> None:
+        self._begun = True
+        try:
+            if not self._cancelled:
+                self._work()
+        finally:
+            self._ended = True
+            self._woken.put(None)
 
 
 def _room(depth: int) -> SimpleQueue[None]:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import dis
 import sys
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
+from types import FrameType
 
 import cv2
 import pytest
@@ -15,9 +18,17 @@ from evflow.process.threads import SWITCH_S, ahead, behind, beside, prompt
 
 @pytest.fixture(autouse=True)
 def _no_thread_is_left() -> Iterator[None]:
-    before = threading.active_count()
+    before = len(sys._current_frames())
     yield
-    assert threading.active_count() == before
+    assert wait_for(before) == before
+
+
+def wait_for(threads: int) -> int:
+    """Wait until so few threads run, or ten seconds. Returns their number."""
+    deadline = time.monotonic() + 10
+    while (now := len(sys._current_frames())) > threads and time.monotonic() < deadline:
+        time.sleep(1e-3)
+    return now
 
 
 def counted(log: list[str], wrong_at: int = -1) -> Iterator[int]:
@@ -108,6 +119,57 @@ def test_calls_that_wait_are_dropped_where_the_block_raises() -> None:
     with pytest.raises(KeyboardInterrupt):
         interrupted()
     assert done == [0]  # what was under way was finished
+
+
+def ahead_of_it() -> None:
+    with ahead(range(5), 1) as items:
+        assert list(items) == list(range(5))
+
+
+def behind_it() -> None:
+    with behind(1) as later:
+        for _ in range(3):
+            later(int)
+
+
+@pytest.mark.parametrize("block", [ahead_of_it, behind_it])
+def test_a_signal_at_any_point_ends_the_block_and_its_thread(block: Callable[[], None]) -> None:
+    """As Ctrl-C in the main thread, at each point where Python looks for signals."""
+    points = interrupted_at(block, 10**9)
+    assert points > 30
+    for point in range(points):
+        before = len(sys._current_frames())
+        with contextlib.suppress(KeyboardInterrupt):
+            interrupted_at(block, point)
+        assert wait_for(before) == before, f"a thread is left after point {point}"
+
+
+def interrupted_at(block: Callable[[], None], point: int) -> int:
+    """Call it with a KeyboardInterrupt at this point. Returns the number of points passed."""
+    passed = 0
+    last: dict[FrameType, str] = {}
+
+    def trace(frame: FrameType, event: str, _: object) -> object:
+        nonlocal passed
+        frame.f_trace_opcodes = True
+        if event == "opcode":
+            before = last.get(frame, "")
+            last[frame] = dis.opname[frame.f_code.co_code[frame.f_lasti]]
+            if before.startswith(("RESUME", "CALL", "JUMP_BACKWARD")):
+                passed += 1
+                if passed > point:
+                    sys.settrace(None)
+                    raise KeyboardInterrupt
+        return trace
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        block()
+    finally:
+        sys.settrace(before)
+        last.clear()
+    return passed
 
 
 def test_threads_are_prompt_in_a_block_and_as_before_after_it() -> None:
