@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from types import FrameType
+from typing import Any
 
 import cv2
 import pytest
@@ -149,7 +150,7 @@ def interrupted_at(block: Callable[[], None], point: int) -> int:
     passed = 0
     last: dict[FrameType, str] = {}
 
-    def trace(frame: FrameType, event: str, _: object) -> object:
+    def trace(frame: FrameType, event: str, _: object) -> Any:
         nonlocal passed
         frame.f_trace_opcodes = True
         if event == "opcode":
