@@ -3,12 +3,14 @@ way to stop, and output that nobody reads any more."""
 
 from __future__ import annotations
 
+import _thread
 import contextlib
 import io
 import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from types import FrameType
 from typing import Any, NoReturn, Protocol
@@ -19,6 +21,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from evflow.process.compilation import announced
 
 INTERRUPTED = 130  # the shell's exit code of Ctrl-C
+SOON_S, LOST_S = 0.05, 2.0  # until a signal that cannot be raised, or that was lost, comes again
 
 
 def print_anything() -> None:
@@ -86,29 +89,44 @@ def bar(title: str, shown: bool = True, *, compiles: bool = False) -> Iterator[R
 @contextlib.contextmanager
 def stoppable() -> Iterator[None]:
     """SIGTERM, which schedulers send, ends the block like Ctrl-C: through every `finally`, so that
-    nothing half-written is left. If either signal arrives during garbage collection, which ignores
-    exceptions, or during an import, which compiled modules do not survive or swallow, it is raised
-    again."""
+    nothing half-written is left.
+
+    A signal during garbage collection, which ignores exceptions, or during an import, which
+    compiled modules do not survive or swallow, comes again soon. So does one that is lost
+    elsewhere, as where compiled code calls Python, after a while in which nothing ends.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield  # only the main thread may set handlers
         return
 
-    def later(number: int) -> None:
-        again.append(threading.Timer(0.05, os.kill, (os.getpid(), number)))
-        again[-1].start()
+    def again(number: int, after_s: float) -> None:
+        def send() -> None:
+            time.sleep(after_s)
+            if within:
+                sent.append(number)
+                os.kill(os.getpid(), number)
+
+        _thread.start_new_thread(send, ())
 
     def stop(number: int, frame: FrameType | None) -> None:
-        if _imports(frame) > outside:
-            return later(number)
-        raise KeyboardInterrupt
+        repeated = number in sent
+        if repeated:
+            sent.remove(number)
+        if repeated and _is_ending():
+            again(number, LOST_S)
+        elif _imports(frame) > outside:
+            again(number, SOON_S)
+        else:
+            again(number, LOST_S)
+            raise KeyboardInterrupt
 
     def ignored(lost: Any) -> None:
         if isinstance(lost.exc_value, KeyboardInterrupt):
-            later(signal.SIGTERM)
+            again(signal.SIGTERM, SOON_S)
         else:
             hook(lost)
 
-    again: list[threading.Timer] = []
+    within, sent = True, list[int]()
     outside = _imports(sys._getframe())  # import frames that surround the block itself
     before, hook = signal.signal(signal.SIGTERM, stop), sys.unraisablehook
     keyboard = signal.getsignal(signal.SIGINT)
@@ -118,11 +136,18 @@ def stoppable() -> Iterator[None]:
     try:
         yield
     finally:
-        for timer in again:
-            timer.cancel()
+        within = False
         sys.unraisablehook = hook
         signal.signal(signal.SIGTERM, before)
         signal.signal(signal.SIGINT, keyboard)
+
+
+def _is_ending() -> bool:
+    """Whether the main thread cleans up after a KeyboardInterrupt."""
+    error = sys.exc_info()[1]
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__context__
+    return error is not None
 
 
 def _imports(frame: FrameType | None) -> int:

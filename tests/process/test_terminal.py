@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from evflow.errors import EvflowDataError
+from evflow.process import terminal
 from evflow.process.terminal import INTERRUPTED, stoppable
 from experiments.shared import common
 
@@ -48,6 +51,47 @@ def test_a_signal_where_exceptions_are_ignored_comes_again() -> None:
     with pytest.raises(KeyboardInterrupt), stoppable():
         endless()
     assert (sys.unraisablehook, signal.getsignal(signal.SIGTERM)) == (hook, handler)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_that_is_lost_comes_again(
+    monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    """As where compiled code calls Python and drops its exceptions."""
+    monkeypatch.setattr(terminal, "LOST_S", 0.1)
+
+    def endless() -> None:
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(number)
+        for _ in range(1000):
+            time.sleep(0.01)
+
+    with pytest.raises(KeyboardInterrupt), stoppable():
+        endless()
+
+
+def test_cleaning_up_takes_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(terminal, "LOST_S", 0.02)
+    cleaned = []
+
+    @contextlib.contextmanager
+    def written() -> Iterator[None]:
+        try:
+            yield
+        finally:
+            with contextlib.suppress(ValueError):
+                raise ValueError
+            time.sleep(0.3)
+            cleaned.append(True)
+
+    def work() -> None:
+        with written():
+            signal.raise_signal(signal.SIGTERM)
+            time.sleep(10)
+
+    with pytest.raises(KeyboardInterrupt), stoppable():
+        work()
+    assert cleaned
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

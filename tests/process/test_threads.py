@@ -21,7 +21,7 @@ from evflow.process.threads import SWITCH_S, ahead, behind, beside, prompt
 def _no_thread_is_left() -> Iterator[None]:
     before = len(sys._current_frames())
     yield
-    assert wait_for(before) == before
+    assert wait_for(before) <= before
 
 
 def wait_for(threads: int) -> int:
@@ -142,7 +142,7 @@ def test_a_signal_at_any_point_ends_the_block_and_its_thread(block: Callable[[],
         before = len(sys._current_frames())
         with contextlib.suppress(KeyboardInterrupt):
             interrupted_at(block, point)
-        assert wait_for(before) == before, f"a thread is left after point {point}"
+        assert wait_for(before) <= before, f"a thread is left after point {point}"
 
 
 def interrupted_at(block: Callable[[], None], point: int) -> int:
