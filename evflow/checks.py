@@ -100,6 +100,16 @@ def check_full_scale(full_scale: float) -> int:
     return int(full_scale)
 
 
+def integer_us(t: int) -> int:
+    """A time that must be an integer; raises EV003."""
+    try:
+        return operator.index(t)
+    except TypeError:
+        raise EvflowDataError(
+            "EV003", f"the time {t!r} is a {type(t).__name__}; times are integer us.",
+            "Give int(t) for microseconds, round(1e6 * t) for seconds.") from None
+
+
 def check_times(t: np.ndarray, name: str, *, strict: bool) -> np.ndarray:
     """Times (N,) as sorted int64 (strict: strictly increasing); raises EV003, EV004."""
     if t.size == 0:

@@ -146,6 +146,13 @@ def test_slices_are_half_open_and_partition(t: list[int], a: int, b: int) -> Non
     np.testing.assert_array_equal(total, made.count_map())
 
 
+@pytest.mark.parametrize("t", [1e6, 0.5, None])
+def test_slices_take_integers(t: Any) -> None:
+    with pytest.raises(EvflowDataError, match=r"EV003.*integer us") as raised:
+        events().slice(0, t)
+    assert "round(1e6 * t)" in str(raised.value)
+
+
 def test_slice_copies_nothing() -> None:
     made = events()
     assert np.shares_memory(made.slice(10, 11).x, made.x)

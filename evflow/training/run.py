@@ -144,7 +144,7 @@ def started_from(state: TrainState, weights: str) -> TrainState:
             "EV018", f"{weights} has no part of the network {name!r} of this run, in its sizes.",
             "Start from weights of the same network, or leave --start out.")
     if devices.is_main():
-        print(f"from {weights}: {', '.join(taken)}")
+        print(f"started from {weights}: {', '.join(taken)}")
     begun = {name: fresh | taken}
     return dataclasses.replace(state, params=begun, average=jax.tree.map(jnp.copy, begun))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import operator
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,6 +15,7 @@ from evflow.checks import (
     check_polarity,
     check_size,
     check_times,
+    integer_us,
     read_only,
 )
 from evflow.errors import EvflowDataError
@@ -134,10 +134,12 @@ class Events:
 
         Returns:
             The events of that range; none where it is empty.
+
+        Raises:
+            EvflowDataError: EV003 for times that are no integers.
         """
         whole = np.iinfo(np.int64)
-        bounds = np.array([min(max(operator.index(t), whole.min), whole.max)
-                           for t in (t0_us, t1_us)])
+        bounds = np.array([min(max(integer_us(t), whole.min), whole.max) for t in (t0_us, t1_us)])
         first, last = np.searchsorted(self.t, bounds)
         x, y, t, p = (getattr(self, name)[first:last] for name in COLUMNS)
         return Events.unchecked(x, y, t, p, self.size)
