@@ -42,13 +42,15 @@ def on_disk(limit: int = LITTLE) -> Iterator[None]:
 
 def forget(*arrays: np.ndarray) -> None:
     """Release the memory pages of mapped arrays: their data stay on disk and are read again on
-    demand. Other arrays are unaffected."""
+    demand. Other arrays are unaffected, and so are maps whose changes are in memory alone (mode
+    "c")."""
     for array in arrays:
         base: Any = array
         while isinstance(base, np.ndarray):
             mapped = getattr(base, "_mmap", None)
             if mapped is not None and hasattr(mmap, "MADV_DONTNEED"):
-                mapped.madvise(mmap.MADV_DONTNEED)
+                if getattr(base, "mode", "") != "c":
+                    mapped.madvise(mmap.MADV_DONTNEED)
                 break
             base = base.base
 

@@ -10,7 +10,7 @@ import numpy as np
 from evflow.errors import EvflowDataError
 from evflow.files.limits import read_whole
 from evflow.io.decode import prophesee
-from evflow.io.decode.text import HEAD
+from evflow.io.decode.text import HEAD, is_float
 from evflow.io.decode.units import UNITS_US, shared_unit
 from evflow.io.formats import aedat4, evt2, evt3, evt21
 from evflow.io.formats.ros import ros1, ros2
@@ -35,10 +35,14 @@ def read_triggers(path: Path, events: Events, topic: str | None = None) -> np.nd
         if not len(found):
             raise EvflowDataError("EV001", f"{path} holds no trigger events.", EXPECTED, where=path)
         return found
-    times = np.array(_first_numbers(path))
+    words = _first_words(path)
+    times = np.array([float(word) for word in words])
     if not len(times):
         raise EvflowDataError("EV001", f"{path} holds no times.", EXPECTED, where=path)
-    unit = shared_unit(times, events.t, ["us", *(u for u in UNITS_US if u != "us")])
+    if not np.isfinite(times).all():
+        raise EvflowDataError("EV007", f"{path} holds times that are not finite.", where=path)
+    native = "s" if any("." in word for word in words) else "us"
+    unit = shared_unit(times, events.t, [native, *(u for u in UNITS_US if u != native)])
     if unit is None:
         raise EvflowDataError(
             "EV012", f"the times of {path}, {times.min():g} to {times.max():g}, lie outside the "
@@ -64,19 +68,17 @@ def _recorded(path: Path, topic: str | None) -> np.ndarray | None:
     return READERS[known](path) if known in READERS else np.zeros(0, np.int64)
 
 
-def _first_numbers(path: Path) -> list[float]:
+def _first_words(path: Path) -> list[str]:
+    """The numbers that lines begin with, as written; EV008 where one begins with something else."""
     found = []
     for number, line in enumerate(read_whole(path, MAX_BYTES).decode("utf-8", "replace")
                                   .splitlines(), 1):
         words = re.split(r"[\s,;]+", line.partition("#")[0].strip())
         if words == [""]:
             continue
-        try:
-            found.append(float(words[0]))
-        except ValueError:
-            if number > 1:  # the first line may name the columns
-                raise EvflowDataError("EV008", f"line {number} of {path} begins with {words[0]!r}.",
-                                      EXPECTED, where=path) from None
-    if not np.isfinite(found).all():
-        raise EvflowDataError("EV007", f"{path} holds times that are not finite.", where=path)
+        if is_float(words[0]):
+            found.append(words[0])
+        elif number > 1:  # the first line may name the columns
+            raise EvflowDataError("EV008", f"line {number} of {path} begins with {words[0]!r}.",
+                                  EXPECTED, where=path)
     return found

@@ -21,9 +21,10 @@ import numpy as np
 from evflow.checks import Size
 from evflow.errors import EvflowDataError
 from evflow.io.decode.columns import UNIT
+from evflow.io.decode.columns import whole as whole_valued
 from evflow.io.decode.stream import Gathered
 from evflow.io.decode.tables import Images, Loaded, with_frames
-from evflow.io.decode.units import UNITS_US, shared_unit, written_unit
+from evflow.io.decode.units import other_unit, shared_unit, written_unit
 from evflow.io.hints import Hints
 from evflow.io.images.exposures import (
     Stamps,
@@ -160,9 +161,11 @@ def _loading(
     def load() -> Loaded:
         stamps, unit = stamps_of(name, times, arrays, whole, path), written_unit(times)
         if unit == "auto" and (len(stamps.times) < 2 or np.isfinite(stamps.times).all()):
-            unit = shared_unit(stamps.times, events.t, ["us", *UNITS_US]) or "auto"
-        us, _, exposure_us, _ = to_us(stamps, f"{times} of {path}", unit)
-        return Loaded(Stamps(us, stated_us=exposure_us, notes=stamps.notes),
+            native = "us" if whole_valued(stamps.times) else "s"
+            unit = other_unit(stamps.times, events.t, native) or shared_unit(
+                stamps.times, events.t, [native]) or "auto"
+        us, notes, exposure_us, _ = to_us(stamps, f"{times} of {path}", unit)
+        return Loaded(Stamps(us, stated_us=exposure_us, notes=notes),
                       lambda part: map(_seen, pixels(name, part)))
 
     return load

@@ -73,10 +73,9 @@ def video_unit(times: np.ndarray) -> tuple[str | None, dict[str, float]]:
 
 def usual_unit(times: np.ndarray, units: list[str]) -> str:
     """The unit of `units` in which times (T,) make the more usual video; the first if equal."""
-    step = usual_step(times)
-    if not step > 0:
+    if not usual_step(times) > 0:
         return units[0]
-    return min(units, key=lambda unit: abs(np.log(step * UNITS_US[unit] / (MIDDLE_S * S_US))))
+    return min(units, key=lambda unit: _unlike(times, UNITS_US[unit]))
 
 
 def usual_step(times: np.ndarray) -> float:
@@ -85,10 +84,17 @@ def usual_step(times: np.ndarray) -> float:
 
 
 def shared_unit(times: np.ndarray, t: np.ndarray, units: list[str]) -> str | None:
-    """The unit of `units` in which times (T,) overlap most of the span of events at t (N,) us; the
-    first if equal, None if none overlaps."""
-    best = max(units, key=lambda unit: _shared(times, t, UNITS_US[unit]))
-    return best if _shared(times, t, UNITS_US[best]) > 0 else None
+    """The unit of `units` in which times (T,) fall among events at t (N,) us; None if in none.
+
+    It is the first if they share more there than in a wrong one. Else, as events may be a short
+    part of a recording, that of a usual video, or else that in which they share most.
+    """
+    shared = {unit: _shared(times, t, UNITS_US[unit]) for unit in units}
+    if shared[units[0]] > LEAST_SHARED:
+        return units[0]
+    best = max(units, key=lambda unit: (
+        shared[unit] > 0 and _is_usual(times, UNITS_US[unit]), shared[unit]))
+    return best if shared[best] > 0 else None
 
 
 def other_unit(times: np.ndarray, t: np.ndarray, native: str) -> str | None:
@@ -111,15 +117,27 @@ def too_large(times: np.ndarray, t: np.ndarray) -> str:
 
 def _factor(times: np.ndarray, t: np.ndarray, native: float, factors: list[float]) -> float:
     """The factor at which times (T,) share most with events at t (N,), if at `native` they share
-    nothing, or far less and are no usual video, as they are at that factor; 0 if there is none.
-    Frames may last longer than events, or less: that alone tells nothing."""
+    nothing and are a less usual video, or far less and are no usual video, as they are at that
+    factor; 0 if there is none. Frames may last longer than events, or less, or lie beside a part
+    of them: that alone tells nothing."""
     best = max(factors, key=lambda factor: _shared(times, t, factor))
     most, now = _shared(times, t, best), _shared(times, t, native)
     if now == 0:
-        return best if most > LEAST_SHARED else 0.0
-    native_is, best_is = (USUAL_S[0] <= factor * usual_step(times) / S_US <= USUAL_S[1]
-                          for factor in (native, best))
-    return best if best_is and not native_is and most > FAR_MORE * now else 0.0
+        nearer = usual_step(times) == 0 or _unlike(times, best) < _unlike(times, native)
+        return best if nearer and most > LEAST_SHARED else 0.0
+    return best if (_is_usual(times, best) and not _is_usual(times, native)
+                    and most > FAR_MORE * now) else 0.0
+
+
+def _is_usual(times: np.ndarray, factor: float) -> bool:
+    """Whether times (T,) times a factor, in us, are those of a usual video."""
+    return USUAL_S[0] <= factor * usual_step(times) / S_US <= USUAL_S[1]
+
+
+def _unlike(times: np.ndarray, factor: float) -> float:
+    """How far the step of times (T,) times a factor, in us, is from that of 50 frames/s, in log
+    units."""
+    return float(abs(np.log(factor * usual_step(times) / (MIDDLE_S * S_US))))
 
 
 def _shared(times: np.ndarray, t: np.ndarray, factor: float) -> float:
