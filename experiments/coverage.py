@@ -22,8 +22,15 @@ from evflow import estimate_camera
 from evflow.camera import PARAMETERS
 from evflow.errors import EvflowDataError
 from experiments.shared.cameras import Hidden, Protocol, draw_protocol
-from experiments.shared.common import StudyOptions, begin, conclude, estimator, run_script
-from experiments.shared.coverage_pages import LEVELS, curves, deviations, draw, strata
+from experiments.shared.common import (
+    StudyOptions,
+    at_least,
+    begin,
+    conclude,
+    estimator,
+    run_script,
+)
+from experiments.shared.coverage_pages import LEVELS, curves, deviations, draw, strata, table
 from experiments.shared.many import Setup, enough, study
 
 
@@ -65,7 +72,10 @@ def score(params: Any, hidden: Hidden, protocol: Protocol) -> dict[str, Any] | N
     recording = hidden.recording
     if len(recording.events) < 10:
         return None
-    found = estimate_camera(recording, params)
+    try:
+        found = estimate_camera(recording, params)
+    except EvflowDataError:  # no usable interval
+        return None
     signal = hidden.signal_events()
     row: dict[str, Any] = {"seconds": protocol.frame_ms * protocol.intervals * 1e-3}
     for i, name in enumerate(PARAMETERS):
@@ -86,6 +96,7 @@ def main(options: Options) -> dict[str, Any]:
     begin(options, "coverage")
     if options.intervals is not None and options.seconds is not None:
         raise EvflowDataError("EV020", "--intervals with --seconds.", "Give one of them.")
+    at_least(0.01, seconds=options.seconds)
     estimator(options.weights, "summary")
     count = options.count(options.recordings, debug=12, full=1000)
     protocols = [drawn(np.random.default_rng((options.seed, i)), options) for i in range(count)]
@@ -94,14 +105,7 @@ def main(options: Options) -> dict[str, Any]:
     found = curves(rows)
     result = {"levels": LEVELS.tolist(), "cameras": len(rows), "curves": found,
               "strata": strata(rows)}
-    lines = ["| parameter, stratum | recordings | in 68 % | in 95 % |", "|---|---|---|---|"]
-    i68, i95 = (int(np.argmin(np.abs(LEVELS - level))) for level in (0.68, 0.95))
-    lines += [f"| {name}, {kind} | {len(rows)} | {c[i68]:.0%} | {c[i95]:.0%} |"
-              for name, kinds in found.items() for kind, c in kinds.items()]
-    lines += [f"| {name} | {s['recordings']} | {s['inside 68']:.0%} | {s['inside 95']:.0%} |"
-              for name, s in result["strata"].items()]
-    text = "\n".join(lines)
-    conclude(options, "coverage", result, text)
+    conclude(options, "coverage", result, table(result))
     draw(found, options.out / "coverage.png")
     return result
 

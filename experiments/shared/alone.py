@@ -32,7 +32,8 @@ PAPER_WINDOW, PAPER_FLOW = "paper's flow, one window", "paper's flow, all window
 NETWORK, SUMMARY, WHOLE = "set network alone", "summary everywhere", "whole estimate"
 ESTIMATORS = (PAPER_WINDOW, PAPER_FLOW, WINDOW, FLOW, NETWORK, SUMMARY, WHOLE)
 RATES = (PAPER_WINDOW, WINDOW, NETWORK)  # estimators that estimate noise rates themselves
-SAID = ("One window in one call is the paper's estimator, and `mae_sequence` its footnote 1: |map "
+SAID = ("One window in one call is the paper's estimator (our flow is given the summary of all "
+        "windows, the paper's nothing), and `mae_sequence` its footnote 1: |map "
         "− θ| over pixels and windows. A map that is right about its pixels cannot have it small: "
         "the truth's own is the mean |pixel − θ|, .024 at a mismatch of .03 and .114 at .15. "
         "Noise rates of all windows together are those of the quiet time, but for the paper's "

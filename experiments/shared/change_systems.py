@@ -62,7 +62,9 @@ class Predicted:
 
 
 def make_scene(params: Any, recording: Recording, video: np.ndarray | None = None) -> Scene:
-    found = estimate_camera(recording, params)
+    """The scene, with the thresholds of pixels taken for ideal: a filter adds events to frames as
+    they are, not to the light behind a low-pass."""
+    found = estimate_camera(recording, params, pixel="ideal")
     return Scene(recording, found.camera, found.summary, usable(recording), video)
 
 

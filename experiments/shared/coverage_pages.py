@@ -35,9 +35,15 @@ def curves(rows: Rows) -> dict[str, dict[str, list[float]]]:
     return found
 
 
+def of_level(level: float) -> int:
+    """The index of a level in LEVELS."""
+    return int(np.argmin(np.abs(LEVELS - level)))
+
+
 def strata(rows: Rows) -> dict[str, dict[str, float]]:
     """Coverage of the summary's 68 % and 95 % intervals by stratum."""
     found = {}
+    within = {level: deviations()[of_level(0.01 * level)] for level in (68, 95)}
     for name in PARAMETERS:
         away = np.array([r[f"summary/{name}"] for r in rows])
         values = {"signal events": np.array([r[f"signal/{name}"] for r in rows]),
@@ -47,9 +53,21 @@ def strata(rows: Rows) -> dict[str, dict[str, float]]:
                 used = (np.maximum(value, 0.0) >= low) & (value < high)
                 if used.any():
                     found[f"{name}, {label} {low}-{high}"] = {
-                        "recordings": int(used.sum()), "inside 68": float((away[used] < 1).mean()),
-                        "inside 95": float((away[used] < 1.96).mean())}
+                        "recordings": int(used.sum()),
+                        **{f"inside {level}": float((away[used] < width).mean())
+                           for level, width in within.items()}}
     return found
+
+
+def table(result: dict[str, Any]) -> str:
+    """Markdown: coverage of all, then by stratum."""
+    lines = ["| parameter, stratum | recordings | in 68 % | in 95 % |", "|---|---|---|---|"]
+    i68, i95 = of_level(0.68), of_level(0.95)
+    lines += [f"| {name}, {kind} | {result['cameras']} | {c[i68]:.0%} | {c[i95]:.0%} |"
+              for name, kinds in result["curves"].items() for kind, c in kinds.items()]
+    lines += [f"| {name} | {s['recordings']} | {s['inside 68']:.0%} | {s['inside 95']:.0%} |"
+              for name, s in result["strata"].items()]
+    return "\n".join(lines)
 
 
 def draw(found: dict[str, dict[str, list[float]]], path: Path) -> None:

@@ -34,12 +34,12 @@ def averages(rows: list[dict[str, float]]) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for parameter in PAPER:
         def column(key: str, parameter: str = parameter) -> np.ndarray:
-            return np.array([r[f"{key}/{parameter}"] for r in rows])
+            return np.array([r.get(f"{key}/{parameter}", np.nan) for r in rows])
 
         if not column("true").any():  # pixels that have no such parameter
             continue
         used = column("signal") >= ENOUGH
-        keys = sorted(k.split("/")[0] for k in rows[0] if k.endswith(parameter))
+        keys = sorted({k.split("/")[0] for r in rows for k in r if k.endswith(parameter)})
         result[parameter] = {k: mean(column(k)[used]) for k in keys}
         result[parameter] |= {
             "sequences": int(used.sum()), "median": float(np.median(column("summary")[used]))}
