@@ -12,12 +12,13 @@ import dataclasses
 import math
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
 
-from evflow.camera import THETA_MIN, Camera
+from evflow.camera import PARAMETERS, THETA_MIN, Camera
 from evflow.errors import EvflowDataError
 from evflow.estimation.refine.trace import trace_of_events
 from evflow.light.log_maps import lin_log
@@ -35,7 +36,8 @@ class Fitted:
     camera: maps (H, W), finite and positive everywhere; eta is 0 if a system measures none;
     valid: (2, H, W) bool, ON and OFF, where the map was measured; theta: (2,) median thresholds
     over the valid pixels, ON and OFF (over the whole map if there are none); seconds: run time;
-    notes: sentences.
+    notes: sentences; spread: (2,) standard deviation of pixels' thresholds about the map, by systems
+    that estimate one.
     """
 
     camera: Camera
@@ -43,6 +45,13 @@ class Fitted:
     theta: np.ndarray
     seconds: float
     notes: tuple[str, ...] = ()
+    spread: tuple[float, float] = (0.0, 0.0)
+
+    def save(self, path: Path) -> None:
+        """Write the camera, with the spread as its pixels' standard deviation; all or nothing."""
+        errors = dict(zip(PARAMETERS, (*self.spread, 0.0, 0.0), strict=True))
+        self.camera.save(path, **{
+            f"{name}_std": np.full(self.camera.shape, error) for name, error in errors.items()})
 
     @property
     def found(self) -> np.ndarray:
@@ -52,12 +61,14 @@ class Fitted:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Solution:
-    """A system's unchecked result: theta (2, H, W); valid (2, H, W) bool; eta (2,) in Hz."""
+    """A system's unchecked result: theta (2, H, W); valid (2, H, W) bool; eta (2,) in Hz; spread
+    (2,) as of Fitted."""
 
     theta: np.ndarray
     valid: np.ndarray
     eta: tuple[float, float] = (0.0, 0.0)
     notes: tuple[str, ...] = ()
+    spread: tuple[float, float] = (0.0, 0.0)
 
 
 class System(abc.ABC):
@@ -87,7 +98,7 @@ class System(abc.ABC):
         eta = (jnp.full((height, width), e, jnp.float32) for e in solution.eta)
         camera = Camera(*map(jnp.asarray, theta), *eta).validate()
         return Fitted(camera, valid, np.array(medians), time.perf_counter() - start,
-                      solution.notes)
+                      solution.notes, solution.spread)
 
 
 def nothing(shape: tuple[int, int], note: str, theta: float = UNKNOWN) -> Solution:
@@ -98,12 +109,13 @@ def nothing(shape: tuple[int, int], note: str, theta: float = UNKNOWN) -> Soluti
 
 def constant(
     shape: tuple[int, int], theta: np.ndarray, found: np.ndarray, *notes: str,
-    eta: tuple[float, float] = (0.0, 0.0),
+    eta: tuple[float, float] = (0.0, 0.0), spread: float = 0.0,
 ) -> Solution:
-    """One threshold per polarity, theta (2,), for all pixels; found (2,): whether measured."""
+    """One threshold per polarity, theta (2,), for all pixels; found (2,): whether measured; spread:
+    of both polarities."""
     maps = np.broadcast_to(np.asarray(theta, np.float32)[:, None, None], (2, *shape))
     valid = np.broadcast_to(np.asarray(found, bool)[:, None, None], (2, *shape))
-    return Solution(maps, valid, eta, notes)
+    return Solution(maps, valid, eta, notes, (spread, spread))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -112,7 +112,8 @@ class Lgan(System):
         notes += ["the counts are not explained"] * (not found.all())
         theta = mean.mean(0)
         valid = np.broadcast_to(found[:, None, None], theta.shape)
-        return Solution(theta, valid, (float(runs.eta[0]), float(runs.eta[1])), tuple(notes))
+        return Solution(theta, valid, (float(runs.eta[0]), float(runs.eta[1])), tuple(notes),
+                        (float(spread[:, 0].mean()), float(spread[:, 1].mean())))
 
 
 PUBLISHED = Lgan("published", classes=(24, 3, 3), hidden=(256, 128), rate=4e-4, critic_rate=4e-4,

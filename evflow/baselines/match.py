@@ -66,7 +66,7 @@ class Match(System):
         found = (np.abs(excess) < MATCHED) & (scene.seen[COUNTS] > 0)
         return constant((height, width), theta, found, f"mismatch {sigma:g}",
                         "fresh start" if fresh else "running start",
-                        eta=(float(scene.eta[0]), float(scene.eta[1])))
+                        eta=(float(scene.eta[0]), float(scene.eta[1])), spread=sigma)
 
 
 def chi_square(scene: Scene, excess: np.ndarray) -> float:

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow import Recording, estimate_camera, load_weights
-from evflow.baselines import SYSTEMS
+from evflow.baselines import SYSTEMS, Fitted
 from evflow.camera import THETA_MIN, Camera, Summary, sample_pixels
 from evflow.camera.optics import Optics, read_sensor, read_shared
 from evflow.camera.sensors import SensorModel
@@ -163,15 +163,14 @@ class Workshop:
 
     def compared(self, target: AnyTarget, name: str) -> Camera:
         """Estimate of the target's recording by a compared system."""
-        return self.stored(self.kept(target, name, lambda r: SYSTEMS[name].fit(r).camera,
-                                     target.source))
+        return self.stored(self.kept(target, name, SYSTEMS[name].fit, target.source))
 
     def _estimate(self, target: AnyTarget) -> Path:
         return self.kept(target, OURS, lambda r: estimate_camera(r, self.params), target.source)
 
     def kept(
         self, target: AnyTarget, name: str,
-        measure: Callable[[Recording], Camera | CameraEstimate], source: str,
+        measure: Callable[[Recording], Camera | CameraEstimate | Fitted], source: str,
     ) -> Path:
         """The file of a measurement of the target's recording, made on first use. source: digest of
         the files that it is made from, kept beside it; EV013 where it was made from others."""

@@ -91,8 +91,8 @@ def _key(*words: str) -> Array:
 
 
 def held_out_bank(textures: int, photos: bool = True) -> TextureBank:
-    """Textures of a seed of their own. photos: and scikit-image's photographs, for networks whose
-    training had none."""
+    """Textures of a seed of their own. photos: and scikit-image's photographs, to test networks
+    whose training had none."""
     return make_bank(_key("textures"), textures, photos=photos)
 
 

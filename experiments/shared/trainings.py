@@ -130,11 +130,13 @@ class Trainings:
         return conditions(shop, self.targets, s.names, files)
 
     def _recording(self, target: AnyTarget) -> Recording:
-        """What a target's camera is measured by."""
+        """What a target's camera is measured by. Of textures alone: the released estimator has
+        seen the photographs."""
         if isinstance(target, Recorded):
             return target.recording
         s = self.setting
-        return targets.recording(target, self.held_out_bank, s.learning.data, s.seconds)
+        bank = targets.held_out_bank(s.textures // 2, photos=False)
+        return targets.recording(target, bank, s.learning.data, s.seconds)
 
     def folder(self, condition: Condition, seed: int) -> Path:
         return self.out / "runs" / slug(condition.name) / str(seed)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -153,6 +155,20 @@ def test_what_tells_nothing_gives_a_defined_map(name: str, case: str) -> None:
         values = np.asarray(value)
         assert ((values >= THETA_MIN) & (values <= THETA_MAX)).all()
     assert not found.valid[1].any()  # no OFF event anywhere
+
+
+def test_a_spread_is_saved_as_the_deviation_of_pixels(tmp_path: Path) -> None:
+    class Spread(System):
+        def solve(self, recording: Recording) -> Solution:
+            return Solution(np.full((2, 1, 2), 0.2), np.ones((2, 1, 2), bool), spread=(0.03, 0.05))
+
+    Spread().fit(silent(np.full((2, 1, 2), 9, np.uint8))).save(tmp_path / "spread.npz")
+    camera, std = Camera.load_with_std(tmp_path / "spread.npz")
+    np.testing.assert_allclose(camera.theta_off, [[0.2, 0.2]])
+    assert std is not None
+    np.testing.assert_allclose(std.theta_on, [[0.03, 0.03]])
+    np.testing.assert_allclose(std.theta_off, [[0.05, 0.05]])
+    assert not np.asarray(std.eta_on).any()
 
 
 def test_what_leaves_the_range_is_not_valid() -> None:

@@ -34,7 +34,7 @@ def test_match_on_the_true_video(scene: np.ndarray, mismatch: float) -> None:
     found = Match("given").fit(Recording(events, scene, times))
     assert found.found.all()
     np.testing.assert_allclose(found.theta, [0.25, 0.35], atol=0.02)
-    sigma = float(found.notes[0].split()[1])
+    sigma = found.spread[0]
     assert abs(sigma - mismatch) < 0.06
     assert np.median(found.camera.eta_on) == pytest.approx(0.1, rel=0.5)
 
