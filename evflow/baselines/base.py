@@ -18,7 +18,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from evflow.camera import PARAMETERS, THETA_MIN, Camera
+from evflow.camera import THETA_MIN, Camera
 from evflow.errors import EvflowDataError
 from evflow.estimation.refine.trace import trace_of_events
 from evflow.light.log_maps import lin_log
@@ -36,8 +36,8 @@ class Fitted:
     camera: maps (H, W), finite and positive everywhere; eta is 0 if a system measures none;
     valid: (2, H, W) bool, ON and OFF, where the map was measured; theta: (2,) median thresholds
     over the valid pixels, ON and OFF (over the whole map if there are none); seconds: run time;
-    notes: sentences; spread: (2,) standard deviation of pixels' thresholds about the map, by systems
-    that estimate one.
+    notes: sentences; spread: (2,) standard deviation of pixels' thresholds about the map, if a
+    system estimates one.
     """
 
     camera: Camera
@@ -49,9 +49,9 @@ class Fitted:
 
     def save(self, path: Path) -> None:
         """Write the camera, with the spread as its pixels' standard deviation; all or nothing."""
-        errors = dict(zip(PARAMETERS, (*self.spread, 0.0, 0.0), strict=True))
-        self.camera.save(path, **{
-            f"{name}_std": np.full(self.camera.shape, error) for name, error in errors.items()})
+        on, off, none = (np.full(self.camera.shape, s) for s in (*self.spread, 0.0))
+        self.camera.save(path, theta_on_std=on, theta_off_std=off, eta_on_std=none,
+                         eta_off_std=none)
 
     @property
     def found(self) -> np.ndarray:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+
 STEPS = 8  # fixed-point iterations, each of which at least halves the error
 LEAST = 1e-4  # of a leak period that other events interrupt
 
@@ -20,6 +22,13 @@ def without_leak(eta_on: Any, eta_off: Any, leak_hz: Any, resets: bool = True) -
         seen = leak_hz * waited / xp.expm1(waited) if resets else leak_hz
         left = xp.maximum(eta_on - seen, 0.0)
     return left
+
+
+def shot_eta(eta_on: float, eta_off: float, leak_hz: float) -> float:
+    """A camera's noise rate without its leak, mean of ON and OFF, in Hz: what its shot noise is the
+    rate of (`SensorModel.shot_eta_hz`)."""
+    on = np.float64(eta_on)
+    return 0.5 * (float(without_leak(on, eta_off, leak_hz) if leak_hz else on) + eta_off)
 
 
 def leak_behind(seen_hz: float, others_hz: float) -> float:

@@ -16,12 +16,14 @@ from typing import Any
 import numpy as np
 
 from evflow.camera.file import PARAMETERS
+from evflow.camera.leak import shot_eta
 from evflow.camera.prior import Summary
 from evflow.camera.sensors import DeadContrast, LogMap, SensorModel
 from evflow.errors import EvflowDataError
 from evflow.files.archives import load_npz
 
 MEASURED = ("cutoff_hz", "refractory_s", "leak_hz", "shot_hz")  # of a SensorModel, with an error
+SHOT_ETA = "shot_eta_hz"
 LAW = "cutoff_by_light"  # 1 or 0
 MAP = "log_eps"  # 1: the sensor's log map is "log_eps", 0: "linlog"
 LOSS = "dead_contrast"  # index in LOSSES
@@ -54,6 +56,7 @@ def as_arrays(
     """Scalars by their names in camera.npz."""
     named = {f"sensor_{name}": getattr(sensor, name) for name in MEASURED}
     named |= {f"sensor_{name}_std": std.get(name, np.nan) for name in MEASURED}
+    named[f"sensor_{SHOT_ETA}"] = sensor.shot_eta_hz
     named[f"sensor_{LAW}"] = float(sensor.cutoff_by_light)
     named[f"sensor_{MAP}"] = float(sensor.log_map == MAP)
     named[f"sensor_{LOSS}"] = LOSSES.index(sensor.in_dead_time)
@@ -127,7 +130,7 @@ def read_sensor(path: str | os.PathLike) -> tuple[SensorModel, Optics]:
     Raises EV009 if a value is not a finite number, EV016 if there is no file."""
     held = load_npz(Path(path))
     values: dict[str, dict[str, Any]] = {"sensor": {}, "optics": {}}
-    names = {"sensor": (*MEASURED, LAW, MAP, LOSS),
+    names = {"sensor": (*MEASURED, SHOT_ETA, LAW, MAP, LOSS),
              "optics": tuple(f.name for f in dataclasses.fields(Optics))}
     for room, wanted in names.items():
         for name in wanted:
@@ -141,6 +144,11 @@ def read_sensor(path: str | os.PathLike) -> tuple[SensorModel, Optics]:
             values[room][name] = float(value)
     if LAW in values["sensor"]:
         values["sensor"][LAW] = bool(values["sensor"][LAW])
+    if SHOT_ETA not in values["sensor"] and values["sensor"].get("shot_hz"):
+        # Older files lack it, and have a summary.
+        of = (read_summary(path) or ({"eta_on": 0.0, "eta_off": 0.0}, {}))[0]
+        values["sensor"][SHOT_ETA] = shot_eta(
+            of["eta_on"], of["eta_off"], values["sensor"].get("leak_hz", 0.0))
     log_map: LogMap = "log_eps" if values["sensor"].pop(MAP, 0.0) else "linlog"
     if (loss := values["sensor"].pop(LOSS, 0.0)) not in range(len(LOSSES)):
         raise EvflowDataError(

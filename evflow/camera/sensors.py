@@ -29,15 +29,16 @@ KINDS = ("v2e", "esim", "voltmeter", "paper")
 # Options that do not apply to a kind of circuit.
 WITHOUT = {
     "v2e": (),
-    "esim": ("cutoff_hz", "leak_hz", "leak_jitter", "leak_fpn_decades", "shot_hz"),
+    "esim": ("cutoff_hz", "leak_hz", "leak_jitter", "leak_fpn_decades", "shot_hz", "shot_eta_hz"),
     "voltmeter": ("cutoff_hz", "refractory_s", "leak_hz", "leak_jitter", "leak_fpn_decades",
-                  "shot_hz", "noise_resets_memory"),
+                  "shot_hz", "shot_eta_hz", "noise_resets_memory"),
     "paper": ("cutoff_hz", "refractory_s", "leak_hz", "leak_jitter", "leak_fpn_decades", "shot_hz",
-              "noise_resets_memory"),
+              "shot_eta_hz", "noise_resets_memory"),
 }
 
 
-NUMBERS = ("cutoff_hz", "refractory_s", "leak_hz", "leak_jitter", "leak_fpn_decades", "shot_hz")
+NUMBERS = ("cutoff_hz", "refractory_s", "leak_hz", "leak_jitter", "leak_fpn_decades", "shot_hz",
+           "shot_eta_hz")
 SWITCHES = ("cutoff_by_light", "eta_is_all", "eta_intensity", "noise_resets_memory")
 
 
@@ -137,6 +138,8 @@ class SensorModel(Numbers):
         eta_is_all: the camera's eta is all of its noise, as for a measured camera: leak is a part
             of eta_on and has run before the first frame, and shot_hz says how large the rest would
             be in the dark, spread over pixels as eta is. False: leak and shot noise come on top.
+        shot_eta_hz: the eta without leak, mean of ON and OFF, of pixels whose shot noise is
+            shot_hz, with eta_is_all; 0: the mean of the camera's maps, hot pixels included.
         eta_intensity: let eta follow ((F-1) I01 + 1) of Eq. 12 (F = 0.25), relative to the mean
             of the first frame.
         noise_resets_memory: a noise event stores the present log intensity (v2e, real pixels);
@@ -168,6 +171,7 @@ class SensorModel(Numbers):
     leak_jitter: float = 0.0
     leak_fpn_decades: float = 0.0
     shot_hz: float = 0.0
+    shot_eta_hz: float = 0.0
     eta_is_all: bool = False
     eta_intensity: bool = False
     noise_resets_memory: bool = False

@@ -150,7 +150,7 @@ def estimate(
          *noise_notes(shot),
          *drift_notes(quiet.drift, by_drift), *after, *extent.notes(), *drift.notes(thirds)),
         tuple(f"theta_{name}" for name in lacking),
-        **_measured(front_end, refined.optics, leak, shot), extent=extent, thirds=thirds)
+        **_measured(front_end, refined.optics, leak, shot, summary), extent=extent, thirds=thirds)
 
 
 def without_drift(
@@ -191,12 +191,12 @@ def _with_rates(summary: Summary, eta: Array) -> Summary:
 
 
 def _measured(
-    front_end: FrontEnd, optics: Optics | None, leak: Leak, shot: Shot
+    front_end: FrontEnd, optics: Optics | None, leak: Leak, shot: Shot, summary: Summary
 ) -> dict[str, Any]:
     """The fields of a CameraEstimate that are not per pixel."""
     found, dead = front_end.found, front_end.dead
     sensor, std = found.sensor if found else (SensorModel(noise_resets_memory=True), {})
-    sensor, std = measured_noise(sensor, std, leak, shot)
+    sensor, std = measured_noise(sensor, std, leak, shot, summary)
     law = front_end.law
     fields = {"sensor": dataclasses.replace(
                   sensor, refractory_s=dead.seconds,

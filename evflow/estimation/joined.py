@@ -18,6 +18,7 @@ from evflow.files.archives import load_npz
 from evflow.notes import Note
 
 CIRCUIT = ("cutoff_hz", "refractory_s")  # what a scene at rest does not show
+NOISE = ("leak_hz", "shot_hz", "shot_eta_hz")  # and what it shows
 
 
 def with_thresholds(found: CameraEstimate, path: str | os.PathLike) -> CameraEstimate:
@@ -39,7 +40,7 @@ def with_thresholds(found: CameraEstimate, path: str | os.PathLike) -> CameraEst
             f"{found.camera.shape}.", "Join two estimates of one camera.")
     sensor, optics = read_sensor(path)
     sensor = dataclasses.replace(
-        sensor, leak_hz=found.sensor.leak_hz, shot_hz=found.sensor.shot_hz)
+        sensor, **{name: getattr(found.sensor, name) for name in NOISE})
     held = load_npz(Path(path))
     sensor_std = {**found.sensor_std, **{
         name: float(held.get(f"sensor_{name}_std", np.nan)) for name in CIRCUIT}}

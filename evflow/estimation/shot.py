@@ -12,6 +12,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from evflow.camera.leak import shot_eta
+from evflow.camera.prior import Summary
 from evflow.camera.sensors import SensorModel
 from evflow.estimation.leak import Leak
 from evflow.light.log_maps import noise_factor, normalised_intensity
@@ -54,11 +56,13 @@ def scatter(quiet: Array, hot: Array) -> float:
 
 
 def measured_noise(
-    sensor: SensorModel, std: Mapping[str, float], leak: Leak, shot: Shot
+    sensor: SensorModel, std: Mapping[str, float], leak: Leak, shot: Shot, summary: Summary
 ) -> tuple[SensorModel, dict[str, float]]:
-    """A circuit with the measured parts of its noise, which add up to the camera's eta, and the
-    standard deviations."""
-    return (dataclasses.replace(sensor, leak_hz=leak.hz, shot_hz=shot.hz, eta_is_all=True),
+    """A circuit with the measured parts of its noise, which add up to the camera's eta, that of the
+    summary, and the standard deviations."""
+    eta = shot_eta(float(summary.eta_on), float(summary.eta_off), leak.hz) if shot.hz else 0.0
+    return (dataclasses.replace(
+                sensor, leak_hz=leak.hz, shot_hz=shot.hz, shot_eta_hz=eta, eta_is_all=True),
             {**std, "leak_hz": leak.std_hz, "shot_hz": shot.std_hz})
 
 

@@ -21,6 +21,7 @@ from evflow.estimation.pixel_noise import pixel_rates
 from evflow.estimation.remarks import ASSUMED, EVEN_NOISE, dead_notes, noise_notes
 from evflow.estimation.result import THRESHOLDS, CameraEstimate
 from evflow.estimation.shot import Shot, by_light, measured_noise, measured_shot, scatter
+from evflow.light.log_maps import noise_factor, normalised_intensity
 from evflow.notes import Note, why_no_frames
 from evflow.recordings.faulty_pixels import dead_pixels, hot_at_rest
 from evflow.recordings.gaps import joined, stretches
@@ -39,8 +40,9 @@ def estimate_noise(
 ) -> CameraEstimate:
     """eta_on, eta_off (Hz) of every pixel, from the events of a static scene.
 
-    A pixel's rate is that of `pixel_rates`, a hot pixel's its own count. The summary is the mean
-    over pixels that are neither hot nor dead. Thresholds are those of the network's training prior,
+    A pixel's rate is that of `pixel_rates`, a hot pixel's its own count; at the scene's mean light
+    if the noise falls with light. The summary is the mean over pixels that are neither hot nor
+    dead. Thresholds are those of the network's training prior,
     with its width; `valid` is False everywhere. lux: the illuminance, for `.bench`, which
     `noise_over_light` joins. Leak is identified by its intervals, shot noise if frames show the
     light. alone: noise is what was asked for, not what is left without frames. Gaps in the events,
@@ -57,8 +59,10 @@ def estimate_noise(
     if len(recording.frame_times) > 1:
         check_overlap(recording)
     seconds = events.duration_us * 1e-6
+    leak, shot = _kinds(recording, parts, counts, hot | dead)
+    watched = seconds * (_lit(recording, hot | dead) if shot.falls else np.ones(hot.shape))
     rates, errors, means, mean_errors = zip(
-        *(_rates(n, hot, dead, seconds) for n in counts), strict=True)
+        *(_rates(n, hot, dead, watched) for n in counts), strict=True)
     middle, width = uniform(PRESETS["default"].prior.theta)
     mismatch, mismatch_width = uniform(PRESETS["default"].prior.mismatch)
 
@@ -69,12 +73,12 @@ def estimate_noise(
     def summary(theta: float, eta: tuple[float, ...], sigma: float) -> Summary:
         return Summary(*(jnp.float32(v) for v in (theta, theta, *eta, sigma, sigma)))
 
-    leak, shot = _kinds(recording, parts, counts, hot | dead)
-    sensor, std = measured_noise(SensorModel(noise_resets_memory=True), {}, leak, shot)
+    known = summary(middle, means, mismatch)
+    sensor, std = measured_noise(SensorModel(noise_resets_memory=True), {}, leak, shot, known)
     level = () if lux is None else (Level(
         lux, 1, seconds, means[0], mean_errors[0], means[1], mean_errors[1]),)
     return CameraEstimate(
-        camera(middle, rates), camera(width, errors), summary(middle, means, mismatch),
+        camera(middle, rates), camera(width, errors), known,
         summary(width, mean_errors, mismatch_width), np.zeros(hot.shape, bool), total, hot,
         dead, 0,
         (*_notes(hot, total, recording.has_frames),
@@ -109,8 +113,19 @@ def _kinds(
         return leak, Shot()
     watched = np.full(faulty.shape, sum(part.duration_us for part in parts) * 1e-6)
     quiet = np.stack([np.stack([n, watched]) for n in counts])
-    light = by_light(quiet, recording.frame_dn(len(recording.frame_times) // 2), faulty)
+    light = by_light(quiet, _frame(recording), faulty)
     return leak, measured_shot(light, leak.rate_hz, scatter(quiet, faulty))
+
+
+def _frame(recording: Recording) -> np.ndarray:
+    """A frame (H, W) in DN from the middle of the recording."""
+    return recording.frame_dn(len(recording.frame_times) // 2)
+
+
+def _lit(recording: Recording, faulty: np.ndarray) -> np.ndarray:
+    """(H, W): v2e's shot noise of a pixel's light, relative to its mean over the others."""
+    factor = noise_factor(normalised_intensity(_frame(recording).astype(np.float64).clip(0, 255)))
+    return np.asarray(factor / factor[~faulty].mean())
 
 
 def noise_over_light(found: Sequence[CameraEstimate]) -> CameraEstimate:
@@ -164,14 +179,14 @@ def _require_static(recording: Recording, events: Events, hot: np.ndarray, alone
 
 
 def _rates(
-    counts: np.ndarray, hot: np.ndarray, dead: np.ndarray, seconds: float
+    counts: np.ndarray, hot: np.ndarray, dead: np.ndarray, watched: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float, float]:
     """Rates (H, W) of one polarity in Hz and their std; and the mean over pixels that are neither
-    hot nor dead with its std. Dead pixels have that mean."""
-    normal = counts[~(hot | dead)].astype(np.float64)
+    hot nor dead with its std. Dead pixels have that mean. watched: (H, W) seconds at mean light."""
+    normal, seconds = counts[~(hot | dead)].astype(np.float64), watched[~(hot | dead)].mean()
     mean, variance, least = float(normal.mean()), float(normal.var()), 1.0 / normal.size
     rate, error = pixel_rates(
-        counts, np.where(dead, 0.0, seconds), max(mean, least) / seconds, hot)
+        counts, np.where(dead, 0.0, watched), max(mean, least) / seconds, hot)
     mean_error = np.sqrt(max(variance, mean, least) / normal.size)
     return rate, error, mean / seconds, float(mean_error) / seconds
 

@@ -50,6 +50,7 @@ class Constants:
     leak_jitter: Number
     leak_fpn_decades: Number
     shot_hz: Number
+    shot_eta_hz: Number
     voltmeter: Any
     photoreceptor: Any
 

@@ -159,10 +159,10 @@ def odds(rates: Rates, i01: Values, dt: Values) -> Odds:
 def rates(model: Constants, camera: Camera, reference: Array, nominal: Array) -> Rates:
     """The camera's noise rates.
 
-    reference: the I01 at which eta is given (the mean of the first frame). nominal: the median
-    thresholds (ON, OFF); v2e's shot noise adds R/2 ((F-1) I01 + 1) nominal / theta. If eta includes
-    all noise (`eta_is_all`), leak is subtracted, and the rest, normalised to mean 1 by `nominal`,
-    is the pattern of shot noise.
+    reference: the I01 at which eta is given (the mean of the first frame). nominal: of
+    `nominal_thresholds`; v2e's shot noise adds R/2 ((F-1) I01 + 1) nominal / theta. If eta includes
+    all noise (`eta_is_all`), leak is subtracted, and the rest, normalised by `nominal`, is the
+    pattern of shot noise, unless there is none.
     """
     eta = _but_leak(model, camera)
     if not model.eta_intensity and model.shot_hz is None:
@@ -173,8 +173,10 @@ def rates(model: Constants, camera: Camera, reference: Array, nominal: Array) ->
         gain = 1.0 / noise_factor(reference)
         steady, varying = varying, (eta[0] * gain, eta[1] * gain)
     if model.shot_hz is not None and model.eta_is_all:
-        half = 0.5 * model.shot_hz
-        return Rates((zero, zero), (half * nominal[0] * eta[0], half * nominal[1] * eta[1]))
+        half, shot = 0.5 * model.shot_hz, model.shot_hz > 0  # which is traced
+        falling = (half * nominal[0] * eta[0], half * nominal[1] * eta[1])
+        return Rates(*jax.tree.map(lambda with_it, none: jnp.where(shot, with_it, none),
+                                   ((zero, zero), falling), (steady, varying)))
     if model.shot_hz is not None:
         half = 0.5 * model.shot_hz
         varying = (varying[0] + half * (nominal[0] / camera.theta_on),
@@ -192,7 +194,7 @@ def _but_leak(model: Constants, camera: Camera) -> tuple[Array, Array]:
 
 def nominal_thresholds(model: Constants, camera: Camera) -> Array:
     """Median thresholds (ON, OFF) to which shot noise refers, (2, ...) for maps (..., H, W); if eta
-    includes all noise, one over the mean of the part that is not leak.
+    includes all noise, one over the eta to which it refers, less leak.
 
     A median is a sort: 17 ms on the device for a sensor of 346x260, 1 ms on the host. Call it
     outside jit where the camera is known. Skipped for models without shot noise.
@@ -203,9 +205,9 @@ def nominal_thresholds(model: Constants, camera: Camera) -> Array:
         return jnp.ones((2, *lead), jnp.float32)
     if model.eta_is_all:
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((camera, model))):
-            return _one_over_mean(model, camera)
+            return _one_over_eta(model, camera)
         with jax.ensure_compile_time_eval():
-            return _one_over_mean(model, camera)
+            return _one_over_eta(model, camera)
     if any(isinstance(leaf, jax.core.Tracer) for leaf in theta):
         return jnp.median(jnp.stack(theta).reshape(2, *lead, -1), axis=-1)
     maps = np.stack([np.asarray(t) for t in theta])
@@ -213,9 +215,11 @@ def nominal_thresholds(model: Constants, camera: Camera) -> Array:
         return jnp.asarray(np.median(maps.reshape(2, *lead, -1), axis=-1))
 
 
-def _one_over_mean(model: Constants, camera: Camera) -> Array:
-    mean = jnp.stack(_but_leak(model, camera)).mean((0, -2, -1))
-    return jnp.broadcast_to(1.0 / jnp.maximum(mean, 1e-12), (2, *camera.shape[:-2]))
+def _one_over_eta(model: Constants, camera: Camera) -> Array:
+    eta = jnp.stack(_but_leak(model, camera)).mean((0, -2, -1))
+    if model.shot_eta_hz is not None:
+        eta = jnp.where(model.shot_eta_hz > 0, model.shot_eta_hz, eta)  # it may be traced
+    return jnp.broadcast_to(1.0 / jnp.maximum(eta, 1e-12), (2, *camera.shape[:-2]))
 
 
 def is_noisy(model: Constants, camera: Camera) -> bool:

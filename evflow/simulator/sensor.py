@@ -158,7 +158,8 @@ def start(
         noise.leak_rates(model, flat.theta_on, pattern) if model.leak_hz is not None else None,
     )
     if phase is None and model.eta_is_all and sensor.leaking is not None:
-        base = base - _leaked(model, sensor, sensor.leaking, reference)
+        base = base - jnp.where(sensor.leaking > 0, _leaked(
+            model, sensor, sensor.leaking, reference), 0.0)  # it may be traced
     last = jnp.full_like(log_i, pixel.never_fired(model))
     inner = None if model.photoreceptor is None else second_order.at_rest(log_i)
     owed = jnp.zeros_like(log_i) if model.carries_leak else None

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from evflow.camera import Camera, Summary
+from evflow.camera.leak import without_leak
 from evflow.camera.optics import (
     Optics,
     as_arrays,
@@ -28,12 +29,23 @@ def test_it_is_read_as_it_was_written(
     by_light: bool, log_map: Literal["linlog", "log_eps"], tmp_path: Path
 ) -> None:
     sensor = SensorModel(cutoff_hz=150.0, cutoff_by_light=by_light, refractory_s=2e-3, leak_hz=0.1,
-                         shot_hz=2.0, log_map=log_map, eta_is_all=True, noise_resets_memory=True)
+                         shot_hz=2.0, shot_eta_hz=0.7, log_map=log_map, eta_is_all=True,
+                         noise_resets_memory=True)
     optics = Optics(20.0, 1e-3, 4.0, 5e-4, 0.012, 3e-3)
     path = tmp_path / "camera.npz"
     Camera.constant((4, 5)).save(path, **as_arrays(sensor, {"cutoff_hz": 30.0}, optics))
     assert read_sensor(path) == (sensor, optics)
     assert float(np.load(path)["sensor_cutoff_hz_std"]) == 30.0
+
+
+def test_what_shot_noise_refers_to_is_that_of_the_summary_in_older_files(tmp_path: Path) -> None:
+    sensor, path = SensorModel(shot_hz=2.0, leak_hz=0.1), tmp_path / "camera.npz"
+    summary = Summary(*np.array([0.2, 0.3, 0.5, 0.4, 0.0, 0.0]))
+    arrays = as_arrays(sensor, {}, Optics()) | summary_arrays(summary, summary)
+    del arrays["sensor_shot_eta_hz"]
+    Camera.constant((4, 5)).save(path, **arrays)
+    expected = 0.5 * (float(without_leak(np.float64(0.5), 0.4, 0.1)) + 0.4)
+    assert read_sensor(path)[0].shot_eta_hz == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("law", ["keeps", "drops", "resets"])

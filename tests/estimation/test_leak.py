@@ -207,6 +207,25 @@ def test_frames_that_begin_long_before_the_events_are_no_time_at_rest() -> None:
         estimate_noise(Recording(events, frames, times + 1_700_000_000_000_000))
 
 
+@pytest.mark.parametrize("hot_hz", [0.0, 50.0])
+def test_noise_of_a_scene_at_rest_is_simulated_as_it_was_recorded(hot_hz: float) -> None:
+    """From dark to bright columns, beside hot pixels: to 4 %, four sd of 12,000 events."""
+    frame = np.tile(np.linspace(2, 250, 80), (60, 1)).astype(np.uint8)
+    frames, times = np.repeat(frame[None], 301, 0), 100_000 * np.arange(301)
+    hot = np.zeros(frame.shape, np.float32)
+    hot[5::20, 3::20] = hot_hz
+    camera = Camera(*np.full((2, *hot.shape), 0.2, np.float32), hot, hot)
+    events = simulate(jax.random.key(0), frames, times, camera,
+                      model=SensorModel(shot_hz=2.0, noise_resets_memory=True))
+    found = estimate_noise(Recording(events, frames[::50], times[::50]))
+    again = simulate(jax.random.key(1), frames, times, found.camera, model=found.sensor)
+    seen, made = (np.where(hot > 0, 0, e.count_map().sum(0)).reshape(60, 4, 20).sum((0, 2))
+                  for e in (events, again))
+    np.testing.assert_allclose(made, seen, rtol=0.05)
+    seen, made = (e.count_map().sum(0)[hot > 0].sum() for e in (events, again))
+    assert made == pytest.approx(seen, rel=0.05)
+
+
 @pytest.mark.parametrize("falls", [True, False])
 def test_levels_of_light_tell_whether_noise_falls_with_it(falls: bool) -> None:
     """Of one uniform level nothing tells, and a note says so."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -215,6 +216,38 @@ def test_eta_that_is_all_noise_follows_light_where_there_is_shot_noise() -> None
         assert float((on + off).mean()) == pytest.approx(6.0 * factor, rel=1e-5)
         np.testing.assert_allclose(on, 2.0 * off, rtol=1e-5)
         np.testing.assert_allclose(off / off.mean(), uneven / uneven.mean(), rtol=1e-5)
+
+
+def test_hot_pixels_and_crops_leave_the_measured_noise_of_others_alone() -> None:
+    """A rate is shot_hz / shot_eta_hz times the pixel's own eta, whatever its neighbours'."""
+    model = Constants.of(SensorModel(shot_hz=2.0, shot_eta_hz=0.5, eta_is_all=True))
+    eta = np.full((8, 8), 0.5, np.float32)
+    eta[0, 0] = 50.0
+
+    def at(eta: np.ndarray) -> np.ndarray:
+        camera = Camera(*np.full((2, *eta.shape), 0.2, np.float32), eta, eta)
+        seen = rates(model, camera, jnp.float32(0.5), nominal_thresholds(model, camera))
+        return np.asarray(sum(seen.at(jnp.float32(0.0))))
+
+    np.testing.assert_allclose(at(eta), 2.0 * eta / 0.5, rtol=1e-6)
+    np.testing.assert_array_equal(at(eta[:2]), at(eta)[:2])
+
+
+@pytest.mark.parametrize("part", ["shot_hz", "leak_hz"])
+@pytest.mark.parametrize("eta_hz", [0.0, 20.0])
+def test_a_traced_part_of_measured_noise_that_is_0_is_as_if_left_out(
+    part: str, eta_hz: float
+) -> None:
+    rising = jnp.asarray(np.log(np.linspace(BANDS, 1.18 * BANDS, 11)), jnp.float32)
+    camera = Camera.constant(SHAPE, 0.2, 0.2, eta_hz, eta_hz)
+
+    def counted(value: Any) -> jax.Array:
+        model = SensorModel(eta_is_all=True, noise_resets_memory=True, **{part: value})
+        return simulate_counts(jax.random.key(2), rising, camera, frame_dt_s=1e-3, model=model)
+
+    left_out = counted(0.0)
+    assert bool(left_out.any()) == (eta_hz > 0)
+    np.testing.assert_array_equal(jax.jit(counted)(0.0), left_out)
 
 
 def test_leak_has_a_fixed_log_normal_pattern_and_jitter() -> None:
