@@ -54,20 +54,23 @@ def need_folder(out: Path) -> None:
 
 
 def _part_of(path: Path, source: Path) -> bool:
-    """Whether `path` is part of the source folder; films beside what they show are not."""
-    inside = source.is_dir() and path.resolve().is_relative_to(source.resolve())
-    return path.samefile(source) or (inside and path.suffix.lower() not in (".mp4", ".gif"))
+    """Whether `path` is part of the source folder, unless it is a film beside what it shows, or a
+    folder that the source is part of."""
+    here, there = path.resolve(), source.resolve()
+    inside = source.is_dir() and here.is_relative_to(there)
+    return (path.samefile(source) or there.is_relative_to(here)
+            or (inside and path.suffix.lower() not in (".mp4", ".gif")))
 
 
 def need_absent(path: Path, overwrite: bool, *sources: Path | None) -> None:
     """Raise EV013 before long work if the output exists, or is a folder with the name of a file;
-    EV020 if it is one of the sources, or a file in a source folder: what is read may be the only
-    copy."""
+    EV020 if it is one of the sources, a file in a source folder, or a folder around a source: what
+    is read may be the only copy."""
     if not path.exists():
         return
     if any(source is not None and source.exists() and _part_of(path, source)
            for source in sources):
-        raise EvflowDataError("EV020", f"the output {path} is the input, or lies in it.",
+        raise EvflowDataError("EV020", f"the output {path} is the input, lies in it, or holds it.",
                               "Choose another: no command replaces its input.")
     if path.suffix.lower() in FILES:
         need_no_folder(path)

@@ -135,6 +135,8 @@ def read_recording(path: str | os.PathLike, **hints: Unpack[HintArguments]) -> R
     parsed = Hints.parse(hints)
     path = Path(path)
     found = find_format(path)
+    if parsed.events_topic is not None and found in (dsec, event_utils):
+        found = hdf5  # which finds a second camera beside the first
     try:
         with naming(path), watched() as written:
             recording = found.read(path, parsed)

@@ -16,7 +16,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -79,6 +79,7 @@ class EventWriter(abc.ABC):
         self._count = 0  # of the events that wait
         self._last_us = self._last_frame_us = np.zeros(0, np.int64)
         self._depth: np.dtype | None = None
+        self._session: Any = None
 
     def __enter__(self: Self) -> Self:
         self._session = self._writing()
@@ -224,6 +225,9 @@ class EventWriter(abc.ABC):
         """Refuse events that the format cannot hold."""
 
     def _check_times(self, ends: np.ndarray, what: str) -> None:
+        if self._session is None:
+            raise EvflowDataError("EV020", f"{self.path} is not open.",
+                                  "Write within: with ef.open_writer(path, size) as out: ...")
         low, high = self.TIMES_US
         if ends[0] < low or ends[-1] > high:
             raise EvflowDataError(

@@ -14,6 +14,7 @@ import numpy as np
 from evflow.errors import EvflowDataError
 from evflow.io.decode.units import too_large
 from evflow.io.images.exposures import given_exposure, noted
+from evflow.io.images.repeats import REPEATED
 from evflow.io.source import open_frames
 from evflow.light import response as light
 from evflow.light.colour import are_luma, as_seen, mosaic_luma, mosaic_note
@@ -124,7 +125,10 @@ def with_frames(
             f"{(int(t[0]) - seen[0] + offset_us) / 1e3:.3f} if both begin together; for another "
             "unit pass --timestamps-unit.")
     notes = (*noted(recording.notes, 0), Note("frames.replaced", f"frames come from {path}"),
-             *(Note(note.code, _reworded(note.text)) for note in source.notes))
+             *(Note(note.code, _as_frames(note)) for note in source.notes))
+    if left := len(seen) - len(kept):
+        notes = (*notes, Note("frames.unused", f"{left:,} of {len(seen):,} frames of {path} lie "
+                              "before or after the events, and were left out"))
     return Recording(recording.events, np.stack(kept), np.array(times, np.int64), notes,
                      source.exposure_us, full_scale=255)  # `open_frames` has looked for white
 
@@ -132,9 +136,15 @@ def with_frames(
 def _reworded(text: str) -> str:
     """Next to a recording, --time-unit is the events', and --fps that of a video to be written."""
     text = text.replace(" with --frames (simulate: --time-unit)", "")
-    text = text.replace("they give no events, and a double step after; --repeated drop leaves them "
-                        "out.", "an estimate leaves them out.")
     return text.replace("--time-unit", "--timestamps-unit").replace("--fps", "--frames-fps")
+
+
+def _as_frames(note: Note) -> str:
+    """The text of a note on frames that a video is simulated from, for frames of a recording, with
+    the options that there are."""
+    if note.code == REPEATED:
+        return f"{note.text.partition(':')[0]}: an estimate leaves them out."
+    return _reworded(note.text.replace(" (--background black|white)", ""))
 
 
 def _changed(recording: Recording, note: Note, **fields: Any) -> Recording:

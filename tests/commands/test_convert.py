@@ -13,7 +13,7 @@ from helpers.videos import drifting
 
 from evflow.cli import main
 from evflow.commands.writing import Format
-from evflow.io import read_events, read_recording, write_recording
+from evflow.io import read_events, read_recording, write_events, write_recording
 from evflow.io.registry import WRITERS
 from evflow.light.log_maps import delta_log_intensity
 from evflow.recordings import plan_windows
@@ -287,3 +287,15 @@ def test_help_has_an_example(verb: str, capsys: pytest.CaptureFixture[str]) -> N
         main([verb, "--help"])
     assert caught.value.code == 0
     assert f"Example: evflow {verb}" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_folder_that_holds_an_input_is_not_replaced(tmp_path: Path) -> None:
+    recording = make(2000)
+    write_recording(tmp_path / "seq", recording)
+    write_events(tmp_path / "e.h5", recording.events)
+    before = (tmp_path / "seq" / "images.npy").read_bytes()
+    assert main(["convert", str(tmp_path / "e.h5"), str(tmp_path / "seq"), "--overwrite",
+                 "--frames", str(tmp_path / "seq" / "images.npy"),
+                 "--timestamps", str(tmp_path / "seq" / "images_ts.npy"),
+                 "--timestamps-unit", "s"]) != 0
+    assert (tmp_path / "seq" / "images.npy").read_bytes() == before

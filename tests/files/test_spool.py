@@ -186,3 +186,12 @@ def test_a_temporary_folder_that_cannot_be_used_is_not_called_a_damaged_recordin
     monkeypatch.setattr(spool.tempfile, "TemporaryFile", refused)
     with pytest.raises(EvflowDataError, match=rf"EV019.*{why}.*TMPDIR"):
         Spool(np.int64, 0).append(np.arange(10))
+
+
+def test_changes_of_a_copy_on_write_map_are_kept(tmp_path: Path) -> None:
+    """They are in memory alone."""
+    np.save(tmp_path / "p.npy", np.arange(100_000))
+    column = np.load(tmp_path / "p.npy", mmap_mode="c")
+    column[:] = -column
+    spool.forget(column[10:])
+    np.testing.assert_array_equal(column, -np.arange(100_000))

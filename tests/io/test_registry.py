@@ -23,7 +23,7 @@ from evflow import io
 from evflow.errors import EvflowDataError
 from evflow.io import DsecWriter, read_events, read_recording, write_events
 from evflow.io.hints import HintArguments, Hints
-from evflow.io.registry import find_format
+from evflow.io.registry import find_format, open_writer
 from evflow.recordings.windows import iter_windows
 from evflow.types import Events, Recording
 
@@ -319,3 +319,22 @@ def test_times_that_know_their_unit_are_rounded_like_others(tmp_path: Path) -> N
         np.testing.assert_array_equal(us, [0, 1, 2, 2, 3])
         coarse = Hints().microseconds(counts.astype(f"{kind}8[ms]"), "us", 0)
         np.testing.assert_array_equal(coarse, 1000 * counts)
+
+
+def test_a_writer_writes_within_its_block_alone(tmp_path: Path) -> None:
+    out = open_writer(tmp_path / "a.h5", (64, 48))
+    events = Events([1], [1], [1], [1], (64, 48))
+    for write in (lambda: out.append(events),
+                  lambda: out.append_frames(np.zeros((1, 48, 64), np.uint8), np.array([1]))):
+        with pytest.raises(EvflowDataError, match=r"EV020.*not open.*with ef.open_writer"):
+            write()
+
+
+def test_an_event_outside_can_be_left_out_as_the_message_says(tmp_path: Path) -> None:
+    x, path = np.arange(100) % 64, tmp_path / "a.npz"
+    x[50] = 64
+    np.savez(path, x=x, y=x % 48, t=1000 * np.arange(100), p=x % 2, size=(64, 48))
+    error = refused(path)
+    assert "--drop-outside" in str(error)
+    assert "--partial" not in str(error)
+    assert len(read_recording(path, drop_outside=True).events) == 99

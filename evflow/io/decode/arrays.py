@@ -18,7 +18,7 @@ from evflow.checks import Size
 from evflow.errors import EvflowDataError
 from evflow.io.decode import columns, tables, written
 from evflow.io.decode.stream import Chunk, Gathered, gather
-from evflow.io.decode.units import since_1970, written_unit
+from evflow.io.decode.units import without_decimals, written_unit
 from evflow.io.hints import Hints
 from evflow.notes import Note
 
@@ -109,7 +109,7 @@ def in_unit(
     if not first or first[0].t.dtype.kind != "f":
         return chunks, "us"
     t = first[0].t
-    if not columns.whole(t) or (len(t) and since_1970(float(t[0])) == ["s"]):
+    if not columns.whole(t) or without_decimals(t):
         return chunks, "s"
     return chunks if given else in_us(all_whole(path, chunks), "us"), "us"
 

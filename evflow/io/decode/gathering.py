@@ -185,8 +185,8 @@ class Gathering:
         return EvflowDataError(
             "EV005", f"{self.path}: an event at x={chunk.x[i]}, y={chunk.y[i]} is outside "
             f"{width}x{height}, at {spot}{self.so_far()}",
-            why_outside(chunk.x, chunk.y, (width, height)) + self.sound_part(),
-            where=self.path)
+            why_outside(chunk.x, chunk.y, (width, height)) + self.sound_part(
+                "leave such events out: --drop-outside (drop_outside=True)"), where=self.path)
 
     def _turns(self, chunk: Chunk) -> tuple[int, ...]:
         """After how many us times of so few bits as those of the chunk begin anew."""
@@ -246,10 +246,11 @@ class Gathering:
         span = (last - first) // 1000 / 1000
         return f"; {self.seen + begun:,} events up to {span:.3f} s before that are sound."
 
-    def sound_part(self) -> str:
+    def sound_part(self, instead: str = "--partial") -> str:
+        """How to read what is sound. instead: another way than to stop there."""
         until = (self.last - self.first) // 1000 / 1000  # rounded down: all before it is sound
-        return (f", or read the sound part: stop_s={until:.3f} (--stop), or --partial."
-                if until > 0 else ".")
+        sound = f"read the sound part: stop_s={until:.3f} (--stop), or " if until > 0 else ""
+        return f", or {sound}{instead}." if sound or instead != "--partial" else "."
 
     def result(self, size: Size | None) -> tuple[Events, tuple[int, int], tuple[Note, ...]]:
         """The events, the requested range in us, and notes on what was left out."""

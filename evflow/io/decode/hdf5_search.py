@@ -120,14 +120,17 @@ def declared_size(f: Any, group: Any) -> Size | None:
     """(width, height) from attributes or data sets of the group, its `calib`, or the groups it lies
     in."""
     calib = group.get("calib")
-    parts = group.name.strip("/").split("/")
-    around = [f["/".join(parts[:n])] for n in range(len(parts) - 1, 0, -1)]
-    places = [group, *([calib] if hasattr(calib, "keys") else []), *around, f]
-    for place in places:
+    for place in [group, *([calib] if hasattr(calib, "keys") else []), *around(f, group)]:
         for get in (place.attrs.get, lambda name, at=place: _small(at, name)):
             if size := columns.stated_size(get):
                 return size
     return None
+
+
+def around(f: Any, group: Any) -> list[Any]:
+    """The groups that a group lies in, the nearest first and the file last."""
+    parts = group.name.strip("/").split("/")
+    return [*(f["/".join(parts[:n])] for n in range(len(parts) - 1, 0, -1)), f]
 
 
 def arrays_in(f: Any) -> dict[str, Any]:

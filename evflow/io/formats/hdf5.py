@@ -42,6 +42,7 @@ def read(path: Path, hints: Hints) -> Recording:
         group, table = next(pair for pair in found if pair[1].name == name)
         size = hdf5_search.declared_size(f, group)
         unit = table.unit if hints.time_unit == "auto" else hints.time_unit
-        offset = hdf5_search.declared_offset(dataclasses.replace(hints, time_unit=unit), group)
+        offset = hdf5_search.declared_offset(
+            dataclasses.replace(hints, time_unit=unit), group, *hdf5_search.around(f, group))
         gathered = table.gather(path, hints, size, offset)
         return hdf5_search.images_beside(path, f, gathered, hints, name, notes)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from evflow.io.decode import arrays, columns, tables
-from evflow.io.decode.hdf5_search import images_beside
+from evflow.io.decode.hdf5_search import declared_size, images_beside
 from evflow.io.hints import Hints
 from evflow.types import Recording
 
@@ -32,7 +32,7 @@ def read(path: Path, hints: Hints) -> Recording:
     """Raises EV008, EV009, EV010 (h5py) and what `stream.gather` and `Recording` raise."""
     with tables.opened(path) as f:
         data = tables.dataset(path, f, "events", (None, 4))
-        size = tables.frame_size(f.get("frame"))
+        size = tables.frame_size(f.get("frame")) or declared_size(f, f)
 
         def rows(part: slice) -> tuple[Any, Any, Any, Any]:
             t, x, y, p = np.ascontiguousarray(data[part].T)

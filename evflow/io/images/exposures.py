@@ -25,6 +25,7 @@ ENDS = re.compile(r"start|begin"), re.compile(r"end|stop")  # of an exposure, in
 NEAR = 0.1  # of an exposure: times that differ by less are the same, rounded
 NOTED, BLURRED = "frames.exposure", "frames.blur"
 FOREVER_US = 2.0**62
+TICKS = 1e6  # larger whole numbers are hardly ms: 17 minutes
 
 
 class Stamps(NamedTuple):
@@ -61,10 +62,20 @@ def middle(begin: np.ndarray, end: np.ndarray) -> Stamps | None:
     """The stamps of exposures with this begin and end (T,); None if they are something else."""
     if (end < begin).any() or (end[:-1] > begin[1:]).any():
         return None
+    if all(map(_are_ticks, (begin, end))):
+        begin, end = begin.astype(np.int64), end.astype(np.int64)
     lengths = end - begin
     times = (begin + lengths // 2 if begin.dtype == end.dtype == np.int64 else
              begin + 0.5 * lengths)
     return Stamps(times, float(np.median(lengths)) if len(lengths) else 0.0)
+
+
+def _are_ticks(times: np.ndarray) -> bool:
+    """Whether times are counts of a clock, whose middle is one too: integers, or whole floats that
+    are too large for s or ms."""
+    last = float(np.abs(times).max(initial=0))
+    return last < FOREVER_US and (times.dtype.kind in "iu" or (
+        last > TICKS and bool((times % 1 == 0).all())))
 
 
 def ends_of(names: Collection[str]) -> list[str]:

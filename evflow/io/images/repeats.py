@@ -16,6 +16,7 @@ from evflow.io.images.cadence import evened
 from evflow.light.colour import Frames
 from evflow.notes import Note
 
+REPEATED = "frames.repeated"
 LONGEST = 4  # times a converter shows a frame; more, and the scene is static
 LONGEST_ALIKE, MOVES_DN = 12, 1.0  # ... unless frames in a row are shown equally often and change
 # this much in between: 5 frames a second at 60
@@ -84,7 +85,7 @@ class Runs:
         """The note if repeats are kept; None if there are none."""
         count = int(self.repeats().sum()) if self.times else 0
         return None if count < 2 else Note(
-            "frames.repeated", f"{_said(count, len(self.times))}: they give no events, and a "
+            REPEATED, f"{_said(count, len(self.times))}: they give no events, and a "
             "double step after; --repeated drop leaves them out (not of slides, a screen or a "
             "blinking light, which really stay as they are).")
 
@@ -98,7 +99,7 @@ def dropped(open_again: Callable[[], Frames], notes: list[Note]) -> Frames:
     left, times, even = runs.without()
     if count := int((~left).sum()):
         spaced = f"; the others are evenly spaced again, {_rate(times)}" if even else ""
-        notes.append(Note("frames.repeated", f"{_said(count, len(left))}; they were left out "
+        notes.append(Note(REPEATED, f"{_said(count, len(left))}; they were left out "
                           f"(--repeated drop){spaced}."))
     moved = iter(times.tolist())
     for (frame, _), stays in zip(open_again(), left.tolist(), strict=True):

@@ -165,3 +165,14 @@ def test_raw_without_triggers(tmp_path: Path) -> None:
     path.write_bytes(b"% format EVT3;height=10;width=20\n% end\n" + struct.pack("<H", 8 << 12))
     with pytest.raises(EvflowDataError, match=r"EV001.*no trigger events"):
         read_triggers(path, answers([10] * 4, 1))
+
+
+@pytest.mark.parametrize("unit", ["us", "ns", "s"])
+def test_triggers_of_a_minute_beside_a_second_keep_their_unit(tmp_path: Path, unit: str) -> None:
+    times = 2_000_000 * np.arange(30)
+    at = tmp_path / "triggers.txt"
+    at.write_text("\n".join({"us": f"{t}", "ns": f"{1000 * t}", "s": f"{1e-6 * t:.3f}"}[unit]
+                            for t in times))
+    t = np.arange(0, 1_000_000 if unit != "ns" else 59_000_000, 1000)
+    found = read_triggers(at, Events(t % 4, t % 3, t, t % 2, (4, 3)))
+    np.testing.assert_array_equal(found, times)

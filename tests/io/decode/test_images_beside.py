@@ -217,3 +217,17 @@ def test_size_and_offset_in_attributes_around(tmp_path: Path) -> None:
         f["a/b/events"].attrs["t_offset"] = 5000
     found = read_recording(path).events
     assert (found.size, int(found.t[0])) == (SIZE, int(E.t[0]) + 5000)
+
+
+@pytest.mark.parametrize("write", LAYOUTS)
+def test_images_beside_a_part_are_at_their_times(
+    tmp_path: Path, write: Callable[[Path, dict[str, Any]], Path]
+) -> None:
+    """Of frames over a hundred times as long, those beside the first events."""
+    images = np.resize(FRAMES, (1000, *FRAMES.shape[1:]))
+    times = TIMES[0] + 50_000 * np.arange(1000)
+    path = write(tmp_path, {"images": images, "image_ts": times})
+    stop_s = 1e-6 * (float(E.t[-1] - E.t[0]) + 1)
+    found = read_recording(path, stop_s=stop_s)
+    kept = times < E.t[0] + round(1e6 * stop_s)
+    np.testing.assert_array_equal(found.frame_times, times[kept])

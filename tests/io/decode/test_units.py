@@ -19,6 +19,7 @@ from evflow.io.decode.units import (
     too_large,
     usual_unit,
     video_unit,
+    without_decimals,
     written_unit,
 )
 from evflow.types import Events
@@ -272,3 +273,21 @@ def test_few_events_of_a_large_sensor_are_not_taken_for_nanoseconds(tmp_path: Pa
     assert "--time-unit us" in error.fix
     assert "in us they last 2 s" in error.seen or "in us they last 1.99" in error.seen
     assert "in ns 0.00" in error.seen
+
+
+@pytest.mark.parametrize(("begin_us", "unit"), [(3, "us"), (1_200_000, None)])
+def test_frames_beside_a_short_part_of_the_events_keep_their_unit(
+    begin_us: int, unit: str | None
+) -> None:
+    """Twenty a second for a minute, beside the first second, or before them all."""
+    times = begin_us + 50_000 * np.arange(1200)
+    assert other_unit(times, events().t, "us") is None
+    assert shared_unit(times, events().t, ["us"]) == unit
+    assert other_unit(times / 1e6, events().t, "s") is None
+    assert other_unit(times * 1000, events().t, "us") == ("ns" if unit else None)
+
+
+def test_a_clock_of_20_minutes_in_us_is_no_date() -> None:
+    t = 1_200_000_000 + events().t
+    assert not without_decimals(t)
+    assert without_decimals(np.repeat(1_200_000_000 + np.arange(3), 1000))

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from helpers.recordings import SIZE, equal, make, refused
 
+from evflow.errors import EvflowDataError
 from evflow.io import read_events, read_recording
 from evflow.io.registry import find_format
 from evflow.io.source import open_frames
@@ -197,3 +198,29 @@ def test_no_event_at_all(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as f:
         group(f, **{name: column[:0] for name, column in COLUMNS.items()})
     equal(read_events(tmp_path / "a.h5", size=SIZE), Events([], [], [], [], SIZE))
+
+
+@pytest.mark.parametrize("place", ["", "cam/", "cam/events/"])
+def test_an_offset_of_the_times_may_be_of_a_group_around_them(tmp_path: Path, place: str) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as f:
+        for name, column in {"x": [1, 2], "y": [3, 4], "t": [0, 5], "p": [0, 1]}.items():
+            f[f"cam/events/{name}"] = np.array(column)
+        f[f"{place}t_offset"] = np.int64(7_000_000)
+        f["cam"].attrs["resolution"] = (64, 48)
+    assert read_recording(tmp_path / "a.h5").events.t.tolist() == [7_000_000, 7_000_005]
+
+
+@pytest.mark.parametrize("names", ["x y t p", "xs ys ts ps"])
+def test_a_second_camera_beside_the_usual_one_is_read_by_its_name(
+    tmp_path: Path, names: str
+) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as f:
+        for group, first in (("events", 0), ("right", 100)):
+            for name, column in zip(names.split(), ([1, 2], [3, 4], [0, 5], [0, 1]), strict=True):
+                f[f"{group}/{name}"] = np.array(column) + first * (name in ("t", "ts"))
+        f.attrs["sensor_resolution"] = (48, 64)
+    path = tmp_path / "a.h5"
+    assert read_recording(path).events.t.tolist() == [0, 5]
+    assert read_recording(path, events_topic="right").events.t.tolist() == [100, 105]
+    with pytest.raises(EvflowDataError, match=r"EV020.*left.*There are: /events, /right"):
+        read_recording(path, events_topic="left")

@@ -209,3 +209,10 @@ def test_an_exposure_longer_than_the_interval_is_not_believed(tmp_path: Path, na
     found = read_recording(tmp_path / name)
     assert found.exposure_us == 0
     assert any("longer than" in note.text for note in found.notes)
+
+
+@pytest.mark.parametrize("kind", ["u4", "i4", "i8", "u8", "f8"])
+def test_begin_and_end_in_ticks_have_a_middle_in_ticks(tmp_path: Path, kind: str) -> None:
+    begin = 2_000_000 + 40_000 * np.arange(30)
+    np.save(tmp_path / "t.npy", np.stack([begin, begin + 5001], 1).astype(kind))
+    np.testing.assert_array_equal(read_times(tmp_path / "t.npy").us, begin + 2500)
