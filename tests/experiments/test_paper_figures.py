@@ -50,7 +50,8 @@ def table_four() -> dict[str, Figures]:
 
 
 def table_five() -> dict[str, Figures]:
-    rows = {"default": ("default", "see_better"), "S2R": ("s2r", "see_better"),
+    rows = {"default": ("default", "see_better"), "thresholds uniform": ("wide", "see_better"),
+            "S2R": ("s2r", "see_better"),
             "EventGAN": ("eventgan", "see_better_eventgan"), "LGAN": ("lgan", "see_better"),
             "paper's events": ("evflow", "see_better"), "the true": ("oracle", "see_better")}
     paper = {"default": "Original E2V", "S2R": r"GE \(S2R", "EventGAN": r"GE \(EGAN",
@@ -101,8 +102,8 @@ def table_nine() -> dict[str, Figures]:
 
 
 def table_ten() -> dict[str, Figures]:
-    rows = {"ECC": "ecc", "S2R": "s2r", "JAER": "jaer", "paper's flow": "ours, maps",
-            ".2 everywhere": "default .2"}
+    rows = {"ECC |": "ecc", "ECC with": "ecc offset 40", "S2R": "s2r", "JAER": "jaer",
+            "paper's flow": "ours, maps", "count matching": "match", ".2 everywhere": "default .2"}
 
     def of(name: str, table: str) -> Figures:
         paper = numbers(cells("integrate", rf"{name}\|", "paper", table)[0])
