@@ -51,6 +51,16 @@ def parameter(name: str, value: Any) -> Any:
     raise EvflowDataError("EV014", f"{name}={value!r:.60}.", "Give a number.")
 
 
+def full_map(name: str, value: Any, shape: tuple[int, ...]) -> jax.Array:
+    """A map (..., H, W) of a value; raises EV014 as `parameter`, EV002 for values of another
+    shape."""
+    try:
+        return jnp.full(shape, parameter(name, value), jnp.float32)
+    except ValueError:
+        raise EvflowDataError("EV002", f"{name} has shape {np.shape(value)} for maps of {shape}.",
+                              "Give one number, or a map.") from None
+
+
 def number(value: Any) -> float:
     """An argument that is one number, as a float; NaN if it is something else, as text is."""
     try:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evflow.camera import file
-from evflow.camera.arguments import check_key, map_on_host, parameter, real_maps, shape_of_maps
+from evflow.camera.arguments import check_key, full_map, map_on_host, real_maps, shape_of_maps
 from evflow.camera.file import PARAMETERS
 from evflow.camera.prior import CameraPrior, Summary, sample_nominal
 from evflow.checks import need
@@ -87,9 +87,8 @@ class Camera:
         Raises:
             EvflowDataError: EV002 (no shape of maps), EV014 (a value out of range, or no number).
         """
-        shape, values = shape_of_maps(shape), (theta_on, theta_off, eta_on, eta_off)
-        return Camera(*(jnp.full(shape, parameter(name, v), jnp.float32)
-                        for name, v in zip(PARAMETERS, values, strict=True))).validate()
+        named = zip(PARAMETERS, (theta_on, theta_off, eta_on, eta_off), strict=True)
+        return Camera(*(full_map(name, v, shape_of_maps(shape)) for name, v in named)).validate()
 
     @staticmethod
     def sample(key: Array, shape: tuple[int, ...], prior: CameraPrior | None = None) -> Camera:
@@ -132,8 +131,10 @@ class Camera:
             A camera of the same shape, thresholds >= .01, noise rates >= 0.
 
         Raises:
-            EvflowDataError: EV015 (maps of another shape).
+            EvflowDataError: EV015 (maps of another shape), EV020 (no key, or no camera).
         """
+        check_key(key)
+        need(std, Camera, "std", "Give CameraEstimate.std.")
         if std.shape != self.shape:
             raise EvflowDataError("EV015", f"standard deviations of shape {std.shape} for maps of "
                                   f"shape {self.shape}.", "Give those of this camera.")

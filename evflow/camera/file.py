@@ -32,6 +32,9 @@ def write_maps(path: str | os.PathLike, maps: Arrays, extra: Arrays, overwrite: 
     if taken := {*PARAMETERS, "meta"} & set(extra):
         raise EvflowDataError("EV020", f"extra arrays named {', '.join(sorted(taken))}.",
                               "The camera's own maps have these names; choose others.")
+    if objects := [name for name, values in extra.items() if np.asarray(values).dtype.hasobject]:
+        raise EvflowDataError("EV020", f"{', '.join(objects)} hold objects, not numbers or text.",
+                              "Give arrays of numbers.")
     arrays = {**maps, **extra}
     with atomic_write(path, overwrite=overwrite) as temporary:
         with open(temporary, "wb") as opened:

@@ -62,7 +62,8 @@ class SceneConfig:
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             name, value = field.name, getattr(self, field.name)
-            if isinstance(value, tuple):
+            if isinstance(field.default, tuple):
+                require(self, name, isinstance(value, tuple), "a pair, (low, high)")
                 low = 0.0 if name in ("shake_px", "brightness") else -math.inf
                 require(self, name, len(value) == 2 and all(map(math.isfinite, value))
                         and low <= value[0] <= value[1], "two finite numbers, low <= high")
@@ -71,7 +72,8 @@ class SceneConfig:
         for name in _PROBABILITIES:
             require(self, name, 0 <= getattr(self, name) <= 1, "a number in [0, 1]")
         require(self, "brightness", self.brightness[1] <= 1, "a range within [0, 1]")
-        require(self, "foregrounds", self.foregrounds >= 0, "an integer >= 0")
+        require(self, "foregrounds", isinstance(self.foregrounds, int) and self.foregrounds >= 0,
+                "an integer >= 0")
 
     @staticmethod
     def preset(name: Literal["default", "paper"]) -> SceneConfig:

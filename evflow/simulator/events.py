@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from evflow.camera import Camera
 from evflow.camera.sensors import SensorModel
-from evflow.checks import COLUMNS, MOST_SIDE, plain
+from evflow.checks import COLUMNS, MOST_SIDE, need, plain
 from evflow.errors import EvflowDataError
 from evflow.simulator import pack
 from evflow.simulator.active import BLOCK
@@ -148,6 +148,8 @@ def simulate_stream(
         ...         out.append(events)
     """
     check_arguments(key, camera, model)
+    need(frames_iter, Iterable, "frames_iter", "One that yields frames (H, W).")
+    need(times_iter, Iterable, "times_iter", "One that yields times in us.")
     video = blocks(frames_iter, times_iter, camera.shape, BLOCK, copy=True,
                    full_scale=full_scale)
     packed = _packed(key, video, camera, Constants.of(model or SensorModel()))

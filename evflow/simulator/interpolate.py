@@ -48,7 +48,8 @@ def upsample(
         at even times between them, delayed by two input frames (three with an exposure).
 
     Raises:
-        EvflowDataError: EV002 (frames too small or of changing size), EV020.
+        EvflowDataError: EV002 (frames too small or of changing size), EV004 (order), EV007 (NaN),
+            EV020.
     """
     if exposure_us < 0:
         raise EvflowDataError("EV020", f"exposure_us={exposure_us}.", "It must be >= 0.")
@@ -133,10 +134,15 @@ def _many(some: list[Seen], seen: list[Seen]) -> str:
 
 
 def _checked(pairs: Iterable[tuple[np.ndarray, int]]) -> Iterator[tuple[np.ndarray, int]]:
-    """Frames as float32; EV002 where sizes differ or are too small for optical flow."""
-    shape = None
+    """Frames as float32; EV002 where sizes differ or are too small for optical flow, EV004 where
+    times do not increase, EV007 where a frame is not finite."""
+    shape, last = None, -math.inf
     for given, time in pairs:
         frame = np.asarray(given, np.float32)
+        if not time > last:
+            raise EvflowDataError("EV004", f"a frame at {time} us follows one at {last} us.",
+                                  "Times of frames must increase.")
+        last = time
         shape = shape or frame.shape
         if frame.ndim != 2 or frame.shape != shape:
             raise EvflowDataError(
@@ -147,6 +153,9 @@ def _checked(pairs: Iterable[tuple[np.ndarray, int]]) -> Iterator[tuple[np.ndarr
                 "EV002", f"frames of {shape[1]}x{shape[0]} pixels are too small to see motion in: "
                 f"their longer side has less than {MIN_SIDE}.",
                 "Use the frames without interpolation: --no-interpolate, or no upsample.")
+        if not np.isfinite(frame).all():
+            raise EvflowDataError("EV007", f"the frame at {time} us has NaN or infinite values.",
+                                  "Frames must be linear DN.")
         yield frame, int(time)
 
 

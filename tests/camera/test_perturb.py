@@ -296,3 +296,13 @@ def test_maps_may_be_lists_or_bytes_of_another_order(kind: str) -> None:
 def test_what_is_no_key_camera_or_histogram_is_refused(call: Callable) -> None:
     with pytest.raises(EvflowDataError, match="EV020"):
         call(Camera.constant((4, 5)), NoiseHistogram(np.ones((3, 71))))
+
+
+@pytest.mark.parametrize(("said", "make"), [
+    ("EV002.*theta_on has shape", lambda c: Camera.constant((4, 5), np.ones(3))),
+    ("EV020.*key is 0", lambda c: c.drawn(0, c)),
+    ("EV020.*std is of type int", lambda c: c.drawn(jax.random.key(0), 3)),
+    ("EV020.*foo hold objects", lambda c: c.save("a.npz", foo=object()))])
+def test_what_is_no_argument_is_refused(said: str, make: Any) -> None:
+    with pytest.raises(EvflowDataError, match=said):
+        make(Camera.constant((4, 5)))

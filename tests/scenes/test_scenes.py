@@ -223,3 +223,9 @@ def test_the_paper_preset_is_steady_similarity_motion() -> None:
 def test_a_bad_config_is_a_coded_error(bad: dict[str, Any]) -> None:
     with pytest.raises(EvflowDataError, match="EV020"):
         SceneConfig(**bad)
+
+
+@pytest.mark.parametrize("field", [{"speed_px_s": 3.0}, {"zoom": [0.5, 1.0]}, {"foregrounds": 1.5}])
+def test_settings_of_another_type_are_refused(field: dict[str, Any]) -> None:
+    with pytest.raises(EvflowDataError, match=r"EV020.*SceneConfig"):
+        SceneConfig(**field)

@@ -211,3 +211,11 @@ def test_logarithms_of_another_map_are_refused(simulated: Callable[..., jax.Arra
 def test_brightness_in_place_of_logarithms_is_refused() -> None:
     with pytest.raises(EvflowDataError, match=r"EV003.*mean of 100"):
         simulate_voxels(KEY, np.full((3, *SHAPE), 100.0, np.float32), CAMERA, frame_dt_s=1e-3)
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_a_stream_is_of_iterables(which: int) -> None:
+    given: list[Any] = [[], []]
+    given[which] = 3
+    with pytest.raises(EvflowDataError, match=r"EV020.*is of type int"):
+        simulate_stream(jax.random.key(0), *given, Camera.constant((4, 5)))

@@ -372,3 +372,11 @@ def test_motion_step_must_be_positive(step: float) -> None:
 def test_unzip_walks_in_step() -> None:
     frames, times = unzip((i, 10 * i) for i in range(4))
     assert list(zip(frames, times, strict=True)) == [(0, 0), (1, 10), (2, 20), (3, 30)]
+
+
+@pytest.mark.parametrize(("second", "time", "code"), [
+    (100.0, 0, "EV004"), (100.0, -5, "EV004"), (np.nan, 10, "EV007")])
+def test_frames_that_cannot_follow_are_refused(second: float, time: int, code: str) -> None:
+    frames = [np.full((16, 16), value, np.float32) for value in (100.0, second)]
+    with pytest.raises(EvflowDataError, match=code):
+        list(upsample(zip(frames, (0, time), strict=True)))
