@@ -11,6 +11,7 @@ import jax
 import numpy as np
 import pytest
 
+from evflow import estimate_camera
 from experiments import noise_rates
 from experiments.noise_rates import Options
 from experiments.shared import alone, measured_noise, noise_scenes, noise_systems
@@ -182,3 +183,13 @@ def test_every_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         assert max(row["ours"][side][0] for side in ("ON", "OFF")) < 0.05
     moving = result["simulated"]["eq12"]["moving"]["errors"]
     assert moving["counting"]["ON"][0] > 0.05
+
+
+def test_a_dark_scene_has_no_black_level_above_its_light() -> None:
+    """At 25 DN lin-log is much like log_eps less 15 DN, with thresholds 2.7 times as high."""
+    key = jax.random.fold_in(jax.random.key(Options.seed), SCENES.index("moving"))
+    recording, _ = noise_scenes.record(
+        jax.random.fold_in(key, 0), "eq12", "moving", THETA[0], float(DN[0]), 64)
+    found = estimate_camera(recording)
+    assert found.sensor.log_map == "linlog"
+    assert float(found.summary.theta_on) == pytest.approx(THETA[0, 0], rel=0.1)

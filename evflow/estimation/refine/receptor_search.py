@@ -42,6 +42,7 @@ FLOOR = np.array([0.5, 1e-4, 5e-4])  # std of offset, tau and delay
 ALONE = 2.0
 BY_OFFSET = 5.0  # log odds required for an offset in the frames of a slow pixel
 DARK = 0.01  # share of light below lin-log's knee from which the log maps are compared
+SHOWN = 0.01  # share of light that may be darker than a black level
 # Log odds required for another map than lin-log, beside those of a small sample: where lin-log is
 # right, the other gained .4 at most in 63 recordings of 1 s, 3 in 31 small ones of .2 s.
 OTHER_MAP = 2.0
@@ -88,15 +89,18 @@ def _with_map(data: Sample) -> tuple[Regression, np.ndarray, float] | None:
     """The more probable log map, its most probable constants, and the effective number of events;
     None where no threshold follows from them. The maps differ in dim light alone. Each divides the
     events at noise in its own way, and another one must be the better with both: what is divided
-    more finely is explained better by any map."""
-    begun = _begin(data, "linlog")
-    if begun is None or _dark(data) < DARK:
+    more finely is explained better by any map. Nor may it need a black level above what the frames
+    show: log_eps less an offset is much like lin-log in dim light."""
+    begun, light = _begin(data, "linlog"), _light(data)
+    if begun is None or (light < LINLOG_KNEE).mean() < DARK:
         return begun
     model, phi, size = begun
     other = _begin(data, "log_eps", np.where(OFFSET, 0.0, phi))
     if other is None:
         return begun
     rival, there, _ = other
+    if there[0] < -np.quantile(light, SHOWN):
+        return begun
     size = _worth(there, rival, min(size, BELIEVED))
     gain = min(_value(phi, dataclasses.replace(model, data=divided), size)
                - _value(there, dataclasses.replace(rival, data=divided), size)
@@ -104,11 +108,11 @@ def _with_map(data: Sample) -> tuple[Regression, np.ndarray, float] | None:
     return other if gain > OTHER_MAP + small_sample_odds(data) else begun
 
 
-def _dark(data: Sample) -> float:
-    """Share of the used pixels' light, over time, that is below lin-log's knee."""
+def _light(data: Sample) -> np.ndarray:
+    """The light (N,) in DN of the used pixels, over time."""
     stretches = zip(*map(np.asarray, (data.dn, data.pixel, data.weight)), strict=True)
-    light = [dn[:, np.unique(pixel[weight > 0])].ravel() for dn, pixel, weight in stretches]
-    return float((np.concatenate(light) < LINLOG_KNEE).mean())
+    return np.concatenate([
+        dn[:, np.unique(pixel[weight > 0])].ravel() for dn, pixel, weight in stretches])
 
 
 def _begin(
