@@ -135,11 +135,11 @@ class SensorModel(Numbers):
         leak_jitter: relative jitter of each leak step.
         leak_fpn_decades: spread of the leak's fixed pattern over pixels, in decades.
         shot_hz: v2e's shot-noise rate in Hz, both polarities together, on top of the camera's eta.
+        shot_eta_hz: the eta without leak, mean of ON and OFF, of pixels whose shot noise is
+            shot_hz, with eta_is_all; 0: the mean of the camera's maps, hot pixels included.
         eta_is_all: the camera's eta is all of its noise, as for a measured camera: leak is a part
             of eta_on and has run before the first frame, and shot_hz says how large the rest would
             be in the dark, spread over pixels as eta is. False: leak and shot noise come on top.
-        shot_eta_hz: the eta without leak, mean of ON and OFF, of pixels whose shot noise is
-            shot_hz, with eta_is_all; 0: the mean of the camera's maps, hot pixels included.
         eta_intensity: let eta follow ((F-1) I01 + 1) of Eq. 12 (F = 0.25), relative to the mean
             of the first frame.
         noise_resets_memory: a noise event stores the present log intensity (v2e, real pixels);

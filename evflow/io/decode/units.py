@@ -131,7 +131,7 @@ def _factor(times: np.ndarray, t: np.ndarray, native: float, factors: list[float
     best = max(factors, key=lambda factor: _shared(times, t, factor))
     most, now = _shared(times, t, best), _shared(times, t, native)
     if now == 0:
-        nearer = usual_step(times) == 0 or _unlike(times, best) < _unlike(times, native)
+        nearer = not usual_step(times) > 0 or _unlike(times, best) < _unlike(times, native)
         return best if nearer and most > LEAST_SHARED else 0.0
     return best if (_is_usual(times, best) and not _is_usual(times, native)
                     and most > FAR_MORE * now) else 0.0
