@@ -42,13 +42,12 @@ def estimate_noise(
 
     A pixel's rate is that of `pixel_rates`, a hot pixel's its own count; at the scene's mean light
     if the noise falls with light. The summary is the mean over pixels that are neither hot nor
-    dead. Thresholds are those of the network's training prior,
-    with its width; `valid` is False everywhere. lux: the illuminance, for `.bench`, which
-    `noise_over_light` joins. Leak is identified by its intervals, shot noise if frames show the
-    light. alone: noise is what was asked for, not what is left without frames. Gaps in the events,
-    as of lost packets, are not counted as time of observation. Raises EV017 (EV011 unless `alone`)
-    if the scene moves, or the recording is too short to decide; EV012 if frames lie elsewhere in
-    time.
+    dead. Thresholds are those of the network's training prior, with its width; `valid` is False
+    everywhere. lux: the illuminance, for `.bench`, which `noise_over_light` joins. Leak is
+    identified by its intervals, shot noise if frames show the light. alone: noise is what was asked
+    for, not what is left without frames. Gaps in the events, as of lost packets, are not counted as
+    time of observation. Raises EV017 (EV011 unless `alone`) if the scene moves, or the recording is
+    too short to decide; EV012 if frames lie elsewhere in time.
     """
     parts = _observed(recording.events)
     events = joined(parts)

@@ -173,7 +173,7 @@ def rates(model: Constants, camera: Camera, reference: Array, nominal: Array) ->
         gain = 1.0 / noise_factor(reference)
         steady, varying = varying, (eta[0] * gain, eta[1] * gain)
     if model.shot_hz is not None and model.eta_is_all:
-        half, shot = 0.5 * model.shot_hz, model.shot_hz > 0  # which is traced
+        half, shot = 0.5 * model.shot_hz, model.shot_hz > 0  # a traced one may be 0
         falling = (half * nominal[0] * eta[0], half * nominal[1] * eta[1])
         return Rates(*jax.tree.map(lambda with_it, none: jnp.where(shot, with_it, none),
                                    ((zero, zero), falling), (steady, varying)))
