@@ -94,6 +94,7 @@ NOTES: dict[str, str] = {
     "pixels.hot": "pixels fire without a signal",
     "pixels.log": "the pixels' response is logarithmic in dim light too",
     "pixels.lost": "pixels lose contrast in their dead time",
+    "pixels.map": "which logarithm the pixels have in dim light is open",
     "pixels.slow": "the photoreceptor's low-pass was measured",
     "pixels.unsure": "most pixels have no events of their own",
     "noise.assumed": "that noise falls with light is assumed",

@@ -23,6 +23,7 @@ from evflow.estimation.refine import (
     pixel_posterior,
     refine_summary,
 )
+from evflow.estimation.refine.receptor_result import OtherMap
 from evflow.network import api
 from evflow.network.coordinates import SCALE, per_channel, unsquash_summary
 from evflow.network.posterior import Evidence, evidence, posterior
@@ -146,17 +147,30 @@ def _divided(
 def refined(
     params: api.Params, chunks: list[Chunk], summary: Summary, std: Summary, front_end: FrontEnd
 ) -> tuple[Summary, Summary, Optics | None]:
-    """The summary and its std after refinement, and the optics that agree with it."""
+    """The summary and its std after refinement, and the optics that agree with it. What the log map
+    leaves open widens the std, and not the optics."""
     parts = next(iter(params.values()))
     fusion, found = parts.get("fusion"), front_end.found
     refined = refine_summary(chunks, summary, std, fusion, parts.get("signal"),
                              found=found, noise_dn=front_end.noise_dn, blur_s=front_end.blur_s)
-    if found is None or fusion is None:
-        return refined.summary, refined.std, found.optics if found else None
+    if found is None:
+        return refined.summary, refined.std, None
+    std = _with_map_open(refined.summary, refined.std, found.other_map)
+    if fusion is None:
+        return refined.summary, std, found.optics
     theta, stepped, error = (np.array([s.theta_on, s.theta_off], np.float64)
                              for s in (refined.summary, refined.stepped, refined.std))
     change, relative = np.log(theta / stepped).mean(), (error / theta).mean()
-    return refined.summary, refined.std, found.optics_given(float(change), float(relative))
+    return refined.summary, std, found.optics_given(float(change), float(relative))
+
+
+def _with_map_open(summary: Summary, std: Summary, other: OtherMap | None) -> Summary:
+    """The std with the error of thresholds by a log map that may be another one."""
+    if other is None:
+        return std
+    wider = {name: jnp.hypot(getattr(std, name), np.float32(error) * getattr(summary, name))
+             for name, error in zip(("theta_on", "theta_off"), other.theta_error, strict=True)}
+    return dataclasses.replace(std, **wider)
 
 
 def regressed(summary: Summary, std: Summary, found: Found) -> tuple[Summary, Summary]:

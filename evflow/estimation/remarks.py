@@ -8,12 +8,14 @@ from evflow.camera import Summary
 from evflow.camera.optics import Optics
 from evflow.estimation.refine import Found, Lost
 from evflow.estimation.refine.frame_exposure import Exposure
+from evflow.estimation.refine.receptor_result import OtherMap
 from evflow.estimation.shot import Shot
 from evflow.network.pooling import Stats
 from evflow.notes import Note
 from evflow.recordings.check.contents import ACTIVE_SHARE, VALID_EVENTS
 from evflow.training.config import PRESETS
 
+OPEN = 0.5  # of the stated error of theta: a log map that is told to be open is so much of it
 UNDETERMINED = 2.0  # times the stated error of theta: what the light alone may change is told
 FEW_EVENTS = 200  # of a polarity: with fewer its threshold is called uncertain
 
@@ -87,6 +89,10 @@ def receptor_notes(
                       + "; ignoring it would change them where things move fast.")]
     if found.seen.logarithmic:
         notes.append(LOGARITHMIC)
+    stated = np.mean([float(std.theta_on) / float(summary.theta_on),
+                      float(std.theta_off) / float(summary.theta_off)])
+    if found.other_map is not None and found.other_map.theta_error.mean() > OPEN * stated:
+        notes.append(map_note(found.other_map, found.seen.logarithmic))
     if abs(optics.offset_dn) > 2.0 * optics.offset_dn_std:
         more = "more" if optics.offset_dn > 0 else "less"
         notes.append(Note(
@@ -94,8 +100,6 @@ def receptor_notes(
             "frames show (dark current, black level): the thresholds refer to that light. A gamma "
             "of the frames cannot be recognised in a single recording."))
         return notes
-    stated = np.mean([float(std.theta_on) / float(summary.theta_on),
-                      float(std.theta_off) / float(summary.theta_off)])
     if (due := float(found.theta_error.mean())) > UNDETERMINED * stated:
         notes.append(Note(
             "frames.offset", "how much more light the pixels see than the frames show is hardly "
@@ -104,6 +108,18 @@ def receptor_notes(
             "such light; two real DAVIS had 18 and 24 DN. A longer recording, with dark and bright "
             "areas, determines it."))
     return notes
+
+
+def map_note(other: OtherMap, logarithmic: bool) -> Note:
+    """logarithmic: whether the map that was taken is log_eps."""
+    maps = ("lin-log, as v2e's", "logarithmic, as ESIM's")
+    taken, left = maps[::-1] if logarithmic else maps
+    on, off = 100.0 * (other.ratio - 1.0)
+    return Note(
+        "pixels.map", f"the light is too dim to tell the pixels' response: it is taken as {taken}, "
+        f"and may be {left} (probability {other.chance:.0%}), with thresholds {on:+.0f} % (ON) and "
+        f"{off:+.0f} % (OFF) from these, which their errors include. The two are the same in light "
+        "above 20 DN: record a brighter scene.")
 
 
 def exposure_notes(exposure: Exposure) -> list[Note]:

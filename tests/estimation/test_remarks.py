@@ -9,6 +9,7 @@ from evflow.camera import Summary
 from evflow.camera.optics import Optics
 from evflow.camera.sensors import LogMap
 from evflow.estimation.refine import Found
+from evflow.estimation.refine.receptor_result import OtherMap
 from evflow.estimation.remarks import receptor_notes
 from evflow.simulator.photoreceptor import Photoreceptor
 
@@ -16,12 +17,15 @@ SUMMARY = Summary(*(np.float32(v) for v in (0.2, 0.25, 0.1, 0.1, 0.03, 0.03)))
 STD = Summary(*(np.float32(v) for v in (0.01, 0.0125, 0.03, 0.04, 0.005, 0.006)))  # 5 % of theta
 
 
-def told(offset_dn: float, std_dn: float, due: float, log_map: LogMap = "linlog") -> dict[str, str]:
+def told(
+    offset_dn: float, std_dn: float, due: float, log_map: LogMap = "linlog",
+    other: OtherMap | None = None,
+) -> dict[str, str]:
     """The notes, by code, where the constants' errors alone change theta by the share `due`."""
     seen = Photoreceptor(offset_dn, log_map=log_map)
     found = Found(
         seen, np.full(2, 0.3), np.full(2, 0.3), np.diag([std_dn**2, 1e-8, 1e-8]), np.full(2, due),
-        (0.9, 0.9), 0.1, 0.0, 400.0, np.zeros((2, 3)), np.zeros((2, 2)))
+        (0.9, 0.9), 0.1, 0.0, 400.0, np.zeros((2, 3)), np.zeros((2, 2)), other)
     optics = Optics(offset_dn, 0.0, std_dn, 1e-4)
     return {note.code: note.text for note in receptor_notes(found, optics, SUMMARY, STD)}
 
@@ -41,3 +45,15 @@ def test_light_is_told_where_it_is_seen_or_may_matter(
 def test_a_logarithm_in_dark_light_is_told() -> None:
     assert "pixels.log" in told(0.0, 1.0, 0.01, "log_eps")
     assert "pixels.log" not in told(0.0, 1.0, 0.01)
+
+
+@pytest.mark.parametrize(("chance", "told_so"), [(0.4, True), (1e-4, False)])
+def test_a_logarithm_that_the_light_leaves_open_is_told(chance: float, told_so: bool) -> None:
+    notes = told(0.0, 1.0, 0.01, other=OtherMap(chance, np.array([0.5, 0.45])))
+    assert ("pixels.map" in notes) == told_so
+    if told_so:
+        assert "lin-log, as v2e's, and may be logarithmic" in notes["pixels.map"]
+        assert "probability 40%" in notes["pixels.map"]
+        assert "-50 % (ON) and -55 % (OFF)" in notes["pixels.map"]
+        swapped = told(0.0, 1.0, 0.01, "log_eps", OtherMap(chance, np.array([2.0, 2.0])))
+        assert "logarithmic, as ESIM's, and may be lin-log" in swapped["pixels.map"]

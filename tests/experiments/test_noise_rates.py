@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 
-from evflow import estimate_camera
+from evflow import Camera, Recording, SensorModel, estimate_camera, simulate
 from experiments import noise_rates
 from experiments.noise_rates import Options
 from experiments.shared import alone, measured_noise, noise_scenes, noise_systems
@@ -193,3 +193,16 @@ def test_a_dark_scene_has_no_black_level_above_its_light() -> None:
     found = estimate_camera(recording)
     assert found.sensor.log_map == "linlog"
     assert float(found.summary.theta_on) == pytest.approx(THETA[0, 0], rel=0.1)
+
+
+def test_where_it_is_too_dark_to_tell_the_logarithm_the_error_says_so() -> None:
+    """ESIM's pixels, found as lin-log with twice their thresholds: at 25 DN both explain all."""
+    video, times = noise_scenes.video(jax.random.key(3), "moving", 25.0, 64)
+    camera = Camera.constant((64, 64), 0.15, 0.2, 0.1, 0.1)
+    events = simulate(jax.random.key(1), video, times, camera, model=SensorModel(kind="esim"))
+    frames = np.rint(video[::25]).astype(np.uint8)
+    found = estimate_camera(Recording(events, frames, times[::25]))
+    for name, theta in (("theta_on", 0.15), ("theta_off", 0.2)):
+        away = abs(float(getattr(found.summary, name)) - theta)
+        assert away < 2 * float(getattr(found.summary_std, name))
+    assert "pixels.map" in {note.code for note in found.notes}

@@ -21,6 +21,19 @@ STEPPED_LOW, STEPPED_ERROR = 0.02, 0.03
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
+class OtherMap:
+    """The log map that was not taken: its probability, and ratio (2,) of theta by it to theta."""
+
+    chance: float
+    ratio: np.ndarray
+
+    @property
+    def theta_error(self) -> np.ndarray:
+        """(2,) relative error of theta as it may be the right one: a mixture of two values."""
+        return np.sqrt(self.chance) * np.abs(np.log(self.ratio))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
 class Found:
     """Result of the search.
 
@@ -31,7 +44,8 @@ class Found:
     ideal; few: log odds subtracted for a small sample; size: effective number of independent
     events; smear: (2, 3) for each of SMEARS, gain of log unexplained share when counts are averaged
     over it, and changes of log theta_on and log theta_off; curve: (K, 2) CUTOFFS in Hz, and the
-    share explained with each, offset and delay as found."""
+    share explained with each, offset and delay as found; other_map: None where the maps do not
+    differ."""
 
     seen: Photoreceptor
     theta: np.ndarray
@@ -44,6 +58,7 @@ class Found:
     size: float
     smear: np.ndarray
     curve: np.ndarray
+    other_map: OtherMap | None = None
 
     @property
     def std(self) -> np.ndarray:

@@ -18,7 +18,7 @@ from helpers.films import (
 )
 from helpers.samples import NONE_HOT, looked_at, no_readouts
 
-from evflow.estimation.refine import receptor_prior, receptor_search
+from evflow.estimation.refine import receptor_descent, receptor_prior, receptor_search
 from evflow.estimation.refine.path import STEPS
 from evflow.estimation.refine.receptor_data import Sample, sample
 from evflow.estimation.refine.receptor_prior import FEW, FEWER, small_sample_odds
@@ -117,7 +117,7 @@ def test_an_offset_must_explain_something(
     monkeypatch: pytest.MonkeyPatch, asked: float, kept: bool
 ) -> None:
     data = looked_at(24.0, 200.0, 1e-3)
-    monkeypatch.setattr(receptor_search, "BY_OFFSET", asked)
+    monkeypatch.setattr(receptor_descent, "BY_OFFSET", asked)
     found = find(data)
     assert found.needed
     assert found.seen.offset_dn == (pytest.approx(24.0, abs=4.0) if kept else 0.0)
@@ -201,9 +201,9 @@ def test_a_gain_by_a_path_that_explains_little_counts_less() -> None:
     poor = Regression(data._replace(on=data.on + off[0], off=data.off + off[1]))
     left = [model.unexplained(slow) for model in (clear, poor)]
     assert 1 - np.exp(left[0]) > 0.9 > 0.5 > 1 - np.exp(left[1])
-    worth = [receptor_search._worth(slow, model, 400.0) for model in (clear, poor)]
-    assert worth == pytest.approx([400.0, 400.0 * (1 - np.exp(left[1])) / receptor_search.CLEAR])
-    assert receptor_search._worth(slow, poor, 10.0) == 10.0
+    worth = [receptor_descent.worth(slow, model, 400.0) for model in (clear, poor)]
+    assert worth == pytest.approx([400.0, 400.0 * (1 - np.exp(left[1])) / receptor_descent.CLEAR])
+    assert receptor_descent.worth(slow, poor, 10.0) == 10.0
     odds = [receptor_search._odds(slow, poor, 400.0, left[1] + gain) for gain in (0.0, 0.1)]
     assert odds[1] - odds[0] == pytest.approx(0.05 * worth[1])
 
