@@ -83,8 +83,8 @@ def thresholds(
     found |= {name: Thresholds(fitted.camera, seconds=fitted.seconds)
               for name, fitted in alone.fitted(params, part, ours, seconds).items()
               if name != alone.SUMMARY}
-    found["ours, summary"] = Thresholds(constant(shape, ours.summary), seconds=seconds)
-    found["ours, maps"] = Thresholds(ours.camera, seconds=seconds)
+    for name, camera in (("summary", constant(shape, ours.summary)), ("maps", ours.camera)):
+        found[f"ours, {name}"] = Thresholds(camera, ours.optics.offset_dn, seconds)
     if case.truth is not None and case.nominal is not None:
         found["true, nominal"] = Thresholds(constant(shape, case.nominal))
         found["true, maps"] = Thresholds(case.truth)

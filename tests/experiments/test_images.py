@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from evflow import estimate_camera
 from evflow.camera import Camera
 from evflow.types import Events, Recording
 from experiments import changes, integrate
@@ -70,6 +72,22 @@ def test_images_of_the_right_thresholds_are_the_frames() -> None:
         assert 2 * row["right"][0] < row["wrong"][0] < row["none"][0]
     assert rows["1 frame"]["right"][-1] == 8
     assert rows["5 frames"]["right"][-1] == 4
+
+
+def test_our_thresholds_are_of_the_light_that_was_measured_with_them(
+    monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As ECC's authors' are of their offset: other light makes other images of the same events."""
+    recording = sweep()
+    ours = estimate_camera(recording)
+    ours = dataclasses.replace(ours, optics=dataclasses.replace(ours.optics, offset_dn=12.0))
+    monkeypatch.setattr(integrated, "estimate_camera", lambda *_: ours)
+    monkeypatch.setattr(integrated.alone, "fitted", lambda *_: {})
+    case = integrated.Case("ramp", "", recording)
+    found = integrated.thresholds(case, recording, None, ("ecc offset 40",))
+    assert {name: one.offset_dn for name, one in found.items()} == {
+        "no events": 0.0, "default .2": 0.0, "ecc offset 40": 40.0,
+        "ours, summary": 12.0, "ours, maps": 12.0}
 
 
 def test_spans_end_at_the_first_frame_after_so_many_events() -> None:
