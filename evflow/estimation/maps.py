@@ -93,9 +93,10 @@ def with_rates(
         if law is not None:
             mean, error = uneven_rate(events, seconds, mean, error, hot, law[p])
             means[name], mean_errors[name] = jnp.float32(mean), jnp.float32(mean * error)
-        rate, own = pixel_rates(events, seconds, mean, hot, 1.0 if law is None else law[p])
+        rate, own = pixel_rates(
+            events, seconds, mean, hot, 1.0 if law is None else law[p], error=error)
         rates[name] = jax.device_put(rate.astype(np.float32))
-        errors[name] = jax.device_put(np.hypot(own, rate * error).astype(np.float32))
+        errors[name] = jax.device_put(own.astype(np.float32))
     return (dataclasses.replace(camera, **rates), dataclasses.replace(std, **errors),
             dataclasses.replace(summary, **means), dataclasses.replace(summary_std, **mean_errors))
 

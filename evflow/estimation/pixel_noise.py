@@ -12,12 +12,17 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from scipy import special
 
 Array = np.ndarray
 
 SPREADS = np.geomspace(0.02, 2.0, 41)  # standard deviations of the rate, relative to its mean
 SPREAD, SPREAD_ERROR = 0.05, 0.6  # prior median of the spread, and std of its log
 NEGLIGIBLE = 1e-4  # probability below which a spread is left out
+# Pixels that are noisier than the others without being hot: their share, and the shape and mean of
+# their rates relative to the camera's.
+ODD, ODD_SHAPE, ODD_MEAN = 1e-3, 0.5, 5.0
+PASSES = 3
 LEAST_THETA = 0.01  # log units: thresholds are clamped there
 LAW_ODDS = 5.0  # log odds required to let rates follow the thresholds
 LAW_EVENTS = 100  # and events: few events of a pixel also lower its estimated threshold
@@ -89,29 +94,49 @@ def _likelihood(events: Array, expected: Array, hot: Array) -> float:
 
 
 def pixel_rates(
-    events: Array, seconds: Array, rate_hz: float, hot: Array, relative: Array | float = 1.0
+    events: Array, seconds: Array, rate_hz: float, hot: Array, relative: Array | float = 1.0,
+    *, error: float, odd: float = 0.0,
 ) -> tuple[Array, Array]:
-    """Noise rates (H, W) in Hz and their std, around the camera's, which is rate_hz.
+    """Noise rates (H, W) in Hz and their std, around the camera's, which is rate_hz, with this
+    relative error.
 
     events (H, W): sent in the seconds (H, W) for which the pixel was observed, 0 for never. Pixels
     are compared with each other, so residual signal, common to all pixels, cancels. hot (H, W)
     bool: pixels unlike the others, whose rates follow from their own events alone. relative (H, W):
-    rates expected a priori, from `threshold_law`.
+    rates expected a priori, from `threshold_law`. odd: share of pixels that may have any rate
+    without being hot, of which a scene at rest tells; what is likelier to be one has its own.
     """
     n, seconds = events.astype(np.float64), np.asarray(seconds, np.float64)
-    law, seconds = np.broadcast_to(relative, n.shape), seconds * relative
-    sent, watched = float(n[~hot].sum()), float(seconds[~hot].sum())
-    expected = seconds * (sent / watched if watched > 0 else 0.0)
+    law, alone = np.broadcast_to(relative, n.shape), seconds
+    seconds, apart = seconds * relative, np.zeros(n.shape, bool)
+    for _ in range(PASSES):  # odd pixels widen the spread that they are compared with
+        of_usual = _mean_rate(n, seconds, ~(hot | apart))
+        expected = seconds * of_usual
+        shapes, weights = _shapes(n[~(hot | apart)], expected[~(hot | apart)])
+        found = _unlike(n, expected, shapes, weights, odd) if odd else apart
+        if (found == apart).all():
+            break
+        apart = found
     mean, square = np.zeros(n.shape), np.zeros(n.shape)
-    for shape, weight in zip(*_shapes(n[~hot], expected[~hot]), strict=True):
+    for shape, weight in zip(shapes, weights, strict=True):
         relative = (n + shape) / (expected + shape)
         mean += weight * relative
         square += weight * relative * (relative + 1.0 / (expected + shape))
-    rate, std = rate_hz * law * mean, rate_hz * law * np.sqrt(square - mean**2)
+    scale = rate_hz * law
+    if apart.any():
+        scale = scale * of_usual / _mean_rate(n, seconds, ~hot)
+    rate, std = scale * mean, scale * np.sqrt(square - mean**2 + (error * mean) ** 2)
+    free = alone[apart] + ODD_SHAPE / (ODD_MEAN * scale[apart])
+    rate[apart] = (n[apart] + ODD_SHAPE) / free
+    std[apart] = np.sqrt(n[apart] + ODD_SHAPE) / free
     own = hot & (n > 0)
-    alone = seconds[own] / law[own]
-    rate[own], std[own] = n[own] / alone, np.sqrt(n[own] + 1.0) / alone
+    rate[own], std[own] = n[own] / alone[own], np.sqrt(n[own] + 1.0) / alone[own]
     return rate, std
+
+
+def _mean_rate(n: Array, seconds: Array, used: Array) -> float:
+    watched = float(seconds[used].sum())
+    return float(n[used].sum()) / watched if watched > 0 else 0.0
 
 
 def _shapes(n: Array, expected: Array) -> tuple[Array, Array]:
@@ -121,6 +146,21 @@ def _shapes(n: Array, expected: Array) -> tuple[Array, Array]:
     weights /= weights.sum()
     used = weights > NEGLIGIBLE
     return shapes[used], weights[used] / weights[used].sum()
+
+
+def _unlike(n: Array, expected: Array, shapes: Array, weights: Array, odd: float) -> Array:
+    """(H, W) bool: pixels that rather are among the share `odd`, with rates of ODD_SHAPE around
+    ODD_MEAN times the camera's, than among the others."""
+    usual = np.logaddexp.reduce([np.log(weight) + _log_chance(n, expected, shape)
+                                 for shape, weight in zip(shapes, weights, strict=True)])
+    return np.asarray(np.log(odd) + _log_chance(n, ODD_MEAN * expected, ODD_SHAPE) > usual)
+
+
+def _log_chance(n: Array, expected: Array, shape: float) -> Array:
+    """Log probability of counts n, up to their factorial, where rates are gamma-distributed."""
+    return np.asarray(special.gammaln(n + shape) - special.gammaln(shape)
+                      - shape * np.log1p(expected / shape)
+                      + special.xlogy(n, expected / (shape + expected)))
 
 
 def _log_shapes(n: Array, expected: Array) -> Array:

@@ -17,7 +17,7 @@ from evflow.errors import EvflowDataError
 from evflow.estimation.bench.levels import Bench, Level
 from evflow.estimation.intervals import waits_at_rest
 from evflow.estimation.leak import Leak, measured_leak
-from evflow.estimation.pixel_noise import pixel_rates
+from evflow.estimation.pixel_noise import ODD, pixel_rates
 from evflow.estimation.remarks import ASSUMED, EVEN_NOISE, dead_notes, noise_notes
 from evflow.estimation.result import THRESHOLDS, CameraEstimate
 from evflow.estimation.shot import Shot, by_light, measured_noise, measured_shot, scatter
@@ -184,10 +184,11 @@ def _rates(
     hot nor dead with its std. Dead pixels have that mean. watched: (H, W) seconds at mean light."""
     normal, seconds = counts[~(hot | dead)].astype(np.float64), watched[~(hot | dead)].mean()
     mean, variance, least = float(normal.mean()), float(normal.var()), 1.0 / normal.size
+    mean_error = float(np.sqrt(max(variance, mean, least) / normal.size))
     rate, error = pixel_rates(
-        counts, np.where(dead, 0.0, watched), max(mean, least) / seconds, hot)
-    mean_error = np.sqrt(max(variance, mean, least) / normal.size)
-    return rate, error, mean / seconds, float(mean_error) / seconds
+        counts, np.where(dead, 0.0, watched), max(mean, least) / seconds, hot,
+        error=mean_error / max(mean, least), odd=ODD)
+    return rate, error, mean / seconds, mean_error / seconds
 
 
 def _gap_notes(events: Events, gaps: int, seconds: float) -> tuple[Note, ...]:

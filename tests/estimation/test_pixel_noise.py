@@ -10,6 +10,7 @@ from scipy import stats
 from evflow.camera import Camera, Summary
 from evflow.estimation.maps import with_rates, with_unquiet_error
 from evflow.estimation.pixel_noise import (
+    ODD,
     _shapes,
     pixel_rates,
     quiet_time,
@@ -32,7 +33,7 @@ def drawn(spread: float, seconds: np.ndarray, seed: int = 0) -> tuple[np.ndarray
 def test_intervals_hold_the_rates(spread: float) -> None:
     seconds = np.random.default_rng(1).uniform(0.0, 20.0, SHAPE)
     rates, events = drawn(spread, seconds)
-    found, std = pixel_rates(events, seconds, 0.4, NONE_HOT)
+    found, std = pixel_rates(events, seconds, 0.4, NONE_HOT, error=0.0)
     away = np.abs(found - rates) / std
     # A gamma distribution is steeper than a normal one: of spread 1, 86 % lie within its std.
     assert 0.64 < (away < 1).mean() < 0.78
@@ -43,18 +44,49 @@ def test_intervals_hold_the_rates(spread: float) -> None:
 
 def test_equal_pixels_stay_equal() -> None:
     rates, events = drawn(0.0, np.full(SHAPE, 5.0))
-    found, std = pixel_rates(events, np.full(SHAPE, 5.0), 0.4, NONE_HOT)
+    found, std = pixel_rates(events, np.full(SHAPE, 5.0), 0.4, NONE_HOT, error=0.0)
     assert np.abs(found / rates - 1.0).max() < 0.1
     assert std.max() < 0.07 * 0.4
+
+
+def test_what_is_uncertain_of_the_camera_is_so_of_its_pixels_but_not_of_hot_ones() -> None:
+    seconds, hot = np.full(SHAPE, 5.0), NONE_HOT.copy()
+    hot[3, 4] = True
+    _, events = drawn(0.0, seconds)
+    events[3, 4] = 1000
+    (found, own), (same, std) = (pixel_rates(events, seconds, 0.4, hot, error=e) for e in (0, 0.5))
+    np.testing.assert_array_equal(found, same)
+    np.testing.assert_allclose(std[~hot], np.hypot(own, 0.5 * found)[~hot])
+    assert std[3, 4] == own[3, 4]
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.3])
+def test_warm_pixels_of_a_scene_at_rest_have_their_own_rate(spread: float) -> None:
+    """Too noisy for chance, too quiet for hot ones; without the share of odd pixels they were
+    shrunk to a fraction of what they sent, with intervals of several std beside it."""
+    seconds = np.full(SHAPE, 20.0)
+    rates, events = drawn(spread, 0.25 * seconds)
+    warm = np.zeros(SHAPE, bool)
+    warm[10:90:10, 20:120:10] = True
+    rates, events = np.where(warm, 1.5, 0.25 * rates), np.where(
+        warm, np.random.default_rng(2).poisson(1.5 * seconds), events)
+    found, std = pixel_rates(
+        events, seconds, events.mean() / 20.0, NONE_HOT, error=0.0, odd=ODD)
+    away = np.abs(found - rates)[warm] / std[warm]
+    assert (away < 1).mean() > 0.55
+    assert away.max() < 4
+    shrunk, small = pixel_rates(events, seconds, events.mean() / 20.0, NONE_HOT, error=0.0)
+    assert np.abs(found - rates)[~warm].mean() < np.abs(shrunk - rates)[~warm].mean()
+    assert (np.abs(shrunk - rates)[warm] / small[warm]).mean() > 1.5 * away.mean()
 
 
 def test_pixels_that_were_not_watched_have_the_camera_s_rate() -> None:
     seconds = np.where(np.arange(SHAPE[1]) < 64, 10.0, 0.0) * np.ones(SHAPE)
     _, events = drawn(0.5, seconds)
-    found, std = pixel_rates(events, seconds, 0.3, NONE_HOT)
+    found, std = pixel_rates(events, seconds, 0.3, NONE_HOT, error=0.0)
     np.testing.assert_allclose(found[:, 64:], 0.3)
     np.testing.assert_allclose(std[:, 64:], 0.3 * 0.5, rtol=0.1)
-    nothing, wide = pixel_rates(0 * events, 0 * seconds, 0.3, NONE_HOT)
+    nothing, wide = pixel_rates(0 * events, 0 * seconds, 0.3, NONE_HOT, error=0.0)
     np.testing.assert_allclose(nothing, 0.3)
     assert 0.02 < wide.min() / 0.3 == wide.max() / 0.3 < 0.2
 
@@ -66,11 +98,11 @@ def test_hot_pixels_have_their_own_rate_and_leave_the_others_alone() -> None:
     hot[5, 7] = True
     loud = events.copy()
     loud[5, 7] = 400
-    found, std = pixel_rates(loud, seconds, 0.4, hot)
+    found, std = pixel_rates(loud, seconds, 0.4, hot, error=0.0)
     assert found[5, 7] == 100.0
     assert std[5, 7] == pytest.approx(np.sqrt(401) / 4)
     np.testing.assert_array_equal(
-        found[~hot], pixel_rates(events, seconds, 0.4, hot)[0][~hot])
+        found[~hot], pixel_rates(events, seconds, 0.4, hot, error=0.0)[0][~hot])
 
 
 def test_spreads_are_as_likely_as_the_negative_binomial_says() -> None:
@@ -125,7 +157,7 @@ def test_rates_follow_the_thresholds_where_the_events_say_so(share: float) -> No
     assert law is not None
     np.testing.assert_allclose(law, rates / rates.mean((1, 2), keepdims=True), rtol=0.04)
     quiet = quiet_counts(rates, 2.0)
-    found, std = pixel_rates(*quiet[0], rates[0].mean(), NONE_HOT, law[0])
+    found, std = pixel_rates(*quiet[0], rates[0].mean(), NONE_HOT, law[0], error=0.0)
     assert found.mean() == pytest.approx(rates[0].mean(), rel=0.05)
     assert np.median(found) == pytest.approx(np.median(rates[0]), rel=0.05)
     assert (np.abs(found - rates[0]) < 2 * std).mean() > 0.9

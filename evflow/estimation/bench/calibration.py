@@ -26,11 +26,11 @@ from evflow.estimation.bench.rests import LEAST_STEP, rests_between
 from evflow.estimation.bench.steps import (
     camera_rate,
     camera_wide,
+    pixel_and_camera_rates,
     ratio,
     regression,
-    shrunk_rates,
 )
-from evflow.estimation.remarks import LOGARITHMIC
+from evflow.estimation.remarks import LOGARITHMIC, dead_notes
 from evflow.estimation.result import THRESHOLDS, CameraEstimate
 from evflow.notes import Note
 from evflow.recordings.faulty_pixels import dead_pixels
@@ -80,7 +80,9 @@ def calibrate_step(
         steps = dataclasses.replace(steps, unit="lux")
     _check_polarity(steps, recording.has_frames)
     rest = steps.rest
-    hz, kept = camera_rate(rest, steps.rest_s)
+    n_events = steps.counts.sum((0, 1)).astype(np.uint32)
+    dead = dead_pixels(n_events)
+    hz, kept = camera_rate(rest, steps.rest_s, dead)
     strays = steps.seconds[:, None] * hz
     clean = np.maximum(steps.counts - strays[..., None, None], 0.0)
     sized = steps.sized
@@ -106,12 +108,11 @@ def calibrate_step(
         spreads.append(spread)
         maps.append(np.where(sound[i], theta[i], median))
         stds.append(np.where(sound[i], error[i], np.hypot(spread, own)))
-    eta, eta_std = shrunk_rates(rest, steps.rest_s)
-    n_events = steps.counts.sum((0, 1)).astype(np.uint32)
+    eta, eta_std = pixel_and_camera_rates(rest, steps.rest_s, dead)
     valid = (sound | ~enough.any((1, 2))[:, None, None]).all(0) & enough.any(0) & kept
     found = _estimate(np.stack(maps), np.stack(stds), medians, spreads, eta, eta_std, valid,
                       n_events, ~kept, int((~missed).sum()),
-                      _notes(steps, undetermined, valid, ~kept, missed),
+                      _notes(steps, undetermined, valid, ~kept, dead, missed),
                       tuple(undetermined))
     shown = measured_bench(
         steps.unit, recording.events, steps.spans, steps.settled, steps.quiet, steps.light,
@@ -143,7 +144,7 @@ def _with_right_map(steps: Steps, sent: np.ndarray) -> tuple[Steps, LogMap]:
 
 def _notes(
     steps: Steps, undetermined: Sequence[str], valid: np.ndarray, hot: np.ndarray,
-    missed: np.ndarray,
+    dead: np.ndarray, missed: np.ndarray,
 ) -> tuple[Note, ...]:
     notes = [*skipped_notes(steps.uncovered, steps.silent_s, missed), *steps.notes,
              *few_sizes(steps.changes)]
@@ -156,7 +157,7 @@ def _notes(
     if hot.any():
         notes.append(Note("pixels.hot", f"hot pixels ({hot.sum()}): they fire while nothing "
                           "changes."))
-    return tuple(notes)
+    return (*notes, *dead_notes(dead))
 
 
 def _check_polarity(steps: Steps, framed: bool) -> None:

@@ -19,6 +19,7 @@ from __future__ import annotations
 import numpy as np
 
 from evflow.camera import THETA_MIN
+from evflow.estimation.pixel_noise import ODD, pixel_rates
 from evflow.recordings.faulty_pixels import hot_at_rest
 
 THETA_PRIOR, THETA_PRIOR_STD = 0.3, 0.115  # mean and std of U(.1, .5), without measurements
@@ -189,35 +190,42 @@ def camera_wide(theta: np.ndarray, error: np.ndarray) -> tuple[float, float, flo
     return float(median), float(spread), float(own)
 
 
-def camera_rate(counts: np.ndarray, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-    """Mean rates (2,) in Hz of counts (2, H, W) without hot pixels, and (H, W) bool, the others."""
+def camera_rate(
+    counts: np.ndarray, seconds: float, dead: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean rates (2,) in Hz of counts (2, H, W) without hot and dead pixels, and (H, W) bool, those
+    that are not hot."""
     kept = ~hot_at_rest(counts.sum(0))
-    return counts[:, kept].mean(1) / seconds if seconds > 0 else np.zeros(2), kept
+    used = kept & ~dead
+    return counts[:, used].mean(1) / seconds if seconds > 0 else np.zeros(2), kept
 
 
-def shrunk_rates(
-    counts: np.ndarray, seconds: float
+def pixel_and_camera_rates(
+    counts: np.ndarray, seconds: float, dead: np.ndarray
 ) -> tuple[np.ndarray, tuple[np.ndarray, list[tuple[float, float]]]]:
-    """Noise rates by a gamma posterior whose prior has the camera's mean and spread.
+    """Noise rates by `pixel_rates`, a hot pixel's its own count, a dead one's the camera's.
 
     Args:
         counts: (2, H, W) events at rest.
         seconds: counting time.
+        dead: (H, W) bool.
 
     Returns:
-        Rates (2, H, W) in Hz; their std, and per polarity the mean rate over pixels that are not
-        hot and its std.
+        Rates (2, H, W) in Hz; their std, and per polarity the mean rate over pixels that are
+        neither hot nor dead and its std.
     """
-    hz, kept = camera_rate(counts, seconds)
+    hz, kept = camera_rate(counts, seconds, dead)
     if seconds <= 0:
         flat = np.zeros(counts.shape)
         return flat, (flat, [(0.0, 0.0)] * 2)
+    used = kept & ~dead
     mean = np.maximum(hz, 1e-12)
-    variance = np.array([c[kept].var() / seconds**2 for c in counts])
+    variance = np.array([c[used].var() / seconds**2 for c in counts])
     variance = np.maximum(variance - mean / seconds, 1e-4 * mean**2)
-    rate, shape = (v[:, None, None] for v in (mean / variance, mean**2 / variance))
-    eta = (counts + shape) / (seconds + rate)
-    pixels = max(int(kept.sum()), 1)
+    pixels = max(int(used.sum()), 1)
     error = np.sqrt((mean / seconds + variance) / pixels + 1.0 / (seconds * pixels) ** 2)
-    return eta, (np.sqrt(counts + shape) / (seconds + rate),
-                 [(float(m), float(e)) for m, e in zip(hz, error, strict=True)])
+    watched = np.where(dead, 0.0, seconds)
+    eta, std = np.stack([
+        pixel_rates(c, watched, m, ~kept, error=e / m, odd=ODD)
+        for c, m, e in zip(counts, mean.tolist(), error.tolist(), strict=True)], 1)
+    return eta, (std, [(float(m), float(e)) for m, e in zip(hz, error, strict=True)])
