@@ -14,10 +14,11 @@ polarity: `mae_sequence` (map against the sequence's value: the paper's footnote
 the value it gives; `determined` is the share of recordings where it determined both.
 
 Real recordings have no truth: each system sees the first half of the frames, and its thresholds
-predict the changes between the frames of the second half, beside a regression on those changes
-themselves. That favours least squares, whose criterion it is: what counts cannot explain (noise,
-blur, a gamma of the frames) makes the best two numbers for it no thresholds. It describes, it does
-not rank. Writes compare_systems.json, .md and .png.
+predict the changes between the frames of the second half, each in the logarithm in which it was
+measured (ours with the light that the frames lack), scored in lin-log, beside a regression on those
+changes themselves. That favours least squares, whose criterion it is: what counts cannot explain
+(noise, blur, a gamma of the frames) makes the best two numbers for it no thresholds. Writes
+compare_systems.json, .md and .png.
 """
 
 from __future__ import annotations

@@ -25,13 +25,11 @@ from evflow.baselines.reconstruction import (
     Reconstructor,
     Segment,
     checked,
-    dn_of,
-    log_of,
     segments,
-    slope_of,
     steps_of,
 )
 from evflow.camera import Camera
+from evflow.light.logarithm import Logarithm
 from evflow.types import Events
 
 Array = jax.Array
@@ -89,27 +87,27 @@ class Step:
 
 def relax(
     pixel: Pixel, reference: Reference, dt_s: Values, share: Values, process: float,
-    offset_dn: float,
+    logarithm: Logarithm,
 ) -> Pixel:
     """A pixel dt_s after its last update; reference as at the end of that time."""
     share = share * reference.blend
     forward = reference.before + reference.gain * pixel.since
     backward = reference.after - reference.gain * (reference.total - pixel.since)
-    blended = (1.0 - share) * dn_of(forward, offset_dn) + share * dn_of(backward, offset_dn)
-    y = jnp.where(share > 0, log_of(blended, offset_dn), forward)
+    blended = (1.0 - share) * logarithm.dn(forward) + share * logarithm.dn(backward)
+    y = jnp.where(share > 0, logarithm.of(blended), forward)
     trust = (1.0 - share) * reference.trust_before + share * reference.trust_after
     kept = 1.0 / (1.0 + pixel.variance * trust * dt_s)
     return dataclasses.replace(pixel, x=y + (pixel.x - y) * kept,
                                variance=pixel.variance * kept + process * dt_s)
 
 
-@partial(jax.jit, static_argnames=("process", "offset_dn"))
+@partial(jax.jit, static_argnames=("process", "logarithm"))
 def _follow(
-    pixel: Pixel, reference: Reference, steps: Step, process: float, offset_dn: float
+    pixel: Pixel, reference: Reference, steps: Step, process: float, logarithm: Logarithm
 ) -> Pixel:
     """Pixels (N,) through their events, steps (N, L)."""
     def event(pixel: Pixel, reference: Reference, step: Step) -> Pixel:
-        moved = relax(pixel, reference, step.dt_s, step.share, process, offset_dn)
+        moved = relax(pixel, reference, step.dt_s, step.share, process, logarithm)
         return Pixel(moved.x + step.contrast, moved.variance + step.variance,
                      moved.since + step.contrast)
 
@@ -119,14 +117,14 @@ def _follow(
     return jax.vmap(one)(pixel, reference, steps)
 
 
-_relax = jax.jit(relax, static_argnames=("process", "offset_dn"))
+_relax = jax.jit(relax, static_argnames=("process", "logarithm"))
 
 
 @dataclasses.dataclass(frozen=True)
 class Akf(Reconstructor):
-    """Asynchronous Kalman filter, with published parameters but for the log map (theirs is
-    offset_dn=255, in which steps are a third of ours in mid-grey) and the trust between two frames:
-    the mean of both precisions instead of blended variances.
+    """Asynchronous Kalman filter, with published parameters but for the logarithm (theirs is
+    Logarithm(255, "log"), in which steps are a third of ours in mid-grey) and the trust between two
+    frames: the mean of both precisions instead of blended variances.
 
     reference: "between" (published) or "latest", which uses no later frame.
     process, isolated, refractory: variance per second since a pixel's last update, since the last
@@ -149,7 +147,7 @@ class Akf(Reconstructor):
         frames, frame_times, theta, times = checked(events, frames, frame_times, camera, times)
         width, height = events.size
         noise = self._event_variance(events)
-        start = np.full(height * width, float(log_of(self.start_dn, self.offset_dn)), np.float32)
+        start = np.full(height * width, float(self.logarithm.of(self.start_dn)), np.float32)
         pixel = Pixel(start, np.full_like(start, self.variance), np.zeros_like(start))
         reference, frame = self._blind(start), -1
         images = np.zeros((len(times), height, width), np.float32)
@@ -210,8 +208,8 @@ class Akf(Reconstructor):
         """Log intensity and precision per second (H*W,) of a frame."""
         dn = frame.ravel().astype(np.float32)
         certainty = np.maximum(1.0 - np.abs(2.0 * dn / 255.0 - 1.0) ** SHARPNESS, LEAST_CERTAINTY)
-        per_log = 255.0 * np.asarray(slope_of(dn, self.offset_dn))
-        return np.asarray(log_of(dn, self.offset_dn)), self.trust * PRECISION * certainty / (
+        per_log = 255.0 * np.asarray(self.logarithm.slope(dn))
+        return np.asarray(self.logarithm.of(dn)), self.trust * PRECISION * certainty / (
             per_log * per_log)
 
     def _relaxed(
@@ -222,7 +220,7 @@ class Akf(Reconstructor):
         dt_s = ((now_us - updated) * 1e-6).astype(np.float32)
         share = np.full_like(dt_s, (now_us - span[0]) / (span[1] - span[0]))
         return jax.device_get(
-            _relax(pixel, reference, dt_s, share, self.process, self.offset_dn))
+            _relax(pixel, reference, dt_s, share, self.process, self.logarithm))
 
     def _through(
         self, pixel: Pixel, reference: Reference, events: Events, part: Segment,
@@ -243,7 +241,7 @@ class Akf(Reconstructor):
             steps = jax.tree.map(
                 lambda c, rows=rows, inside=inside: np.where(inside, c[rows], 0), columns)
             mine = jax.tree.map(lambda a, pixels=pixels: a[pixels], (state, reference))
-            moved = _follow(*mine, steps, self.process, self.offset_dn)
+            moved = _follow(*mine, steps, self.process, self.logarithm)
             real = inside[:, 0]
             for into, new in zip(jax.tree.leaves(state), jax.tree.leaves(moved), strict=True):
                 into[pixels[real]] = np.asarray(new)[real]

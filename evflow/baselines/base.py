@@ -22,6 +22,7 @@ from evflow.camera import THETA_MIN, Camera
 from evflow.errors import EvflowDataError
 from evflow.estimation.refine.trace import trace_of_events
 from evflow.light.log_maps import lin_log
+from evflow.light.logarithm import LIN_LOG, Logarithm
 from evflow.recordings import plan_windows
 from evflow.types import Recording
 
@@ -37,7 +38,7 @@ class Fitted:
     valid: (2, H, W) bool, ON and OFF, where the map was measured; theta: (2,) median thresholds
     over the valid pixels, ON and OFF (over the whole map if there are none); seconds: run time;
     notes: sentences; spread: (2,) standard deviation of pixels' thresholds about the map, if a
-    system estimates one.
+    system estimates one; logarithm: that of the thresholds.
     """
 
     camera: Camera
@@ -46,6 +47,7 @@ class Fitted:
     seconds: float
     notes: tuple[str, ...] = ()
     spread: tuple[float, float] = (0.0, 0.0)
+    logarithm: Logarithm = LIN_LOG
 
     def save(self, path: Path) -> None:
         """Write the camera, with the spread as its pixels' standard deviation; all or nothing."""
@@ -77,6 +79,11 @@ class System(abc.ABC):
     # Most recordings in a table: few for systems that train for minutes on each.
     most_recordings: ClassVar[float] = math.inf
 
+    @property
+    def logarithm(self) -> Logarithm:
+        """That of its thresholds."""
+        return LIN_LOG
+
     @abc.abstractmethod
     def solve(self, recording: Recording) -> Solution:
         """The unchecked result; raises EvflowDataError where the recording is insufficient."""
@@ -98,7 +105,7 @@ class System(abc.ABC):
         eta = (jnp.full((height, width), e, jnp.float32) for e in solution.eta)
         camera = Camera(*map(jnp.asarray, theta), *eta).validate()
         return Fitted(camera, valid, np.array(medians), time.perf_counter() - start,
-                      solution.notes, solution.spread)
+                      solution.notes, solution.spread, self.logarithm)
 
 
 def nothing(shape: tuple[int, int], note: str, theta: float = UNKNOWN) -> Solution:

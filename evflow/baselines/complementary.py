@@ -12,7 +12,7 @@ import dataclasses
 
 import numpy as np
 
-from evflow.baselines.reconstruction import Reconstructor, checked, log_of, segments, steps_of
+from evflow.baselines.reconstruction import Reconstructor, checked, segments, steps_of
 from evflow.camera import Camera
 from evflow.types import Events
 
@@ -37,12 +37,12 @@ class Complementary(Reconstructor):
     ) -> np.ndarray:
         frames, frame_times, theta, times = checked(events, frames, frame_times, camera, times)
         width, height = events.size
-        state = np.full(height * width, float(log_of(self.start_dn, self.offset_dn)))
+        state = np.full(height * width, float(self.logarithm.of(self.start_dn)))
         shown, alpha = state, np.full(state.size, self.cutoff_rad_s)
         images = np.zeros((len(times), height, width), np.float32)
         for part in segments(events, frame_times, times):
             if part.frame >= 0:
-                shown = np.asarray(log_of(frames[part.frame], self.offset_dn), np.float64).ravel()
+                shown = np.asarray(self.logarithm.of(frames[part.frame]), np.float64).ravel()
                 alpha = self._alpha(frames[part.frame])
                 state = shown if part.frame == 0 else state
             pixel, step = steps_of(events, part.events, theta)

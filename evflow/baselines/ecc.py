@@ -21,7 +21,7 @@ from evflow.baselines.base import UNKNOWN, Solution, System, constant, intervals
 from evflow.camera import THETA_MIN
 from evflow.errors import EvflowDataError
 from evflow.estimation.refine.trace import trace_of_events
-from evflow.light.log_maps import lin_log
+from evflow.light.logarithm import LIN_LOG, Logarithm
 from evflow.types import Recording
 
 Array = jax.Array
@@ -50,11 +50,15 @@ class Ecc(System):
     span: int = SPAN
     offset_dn: float = 0.0
 
+    @property
+    def logarithm(self) -> Logarithm:
+        return Logarithm(self.offset_dn, "log") if self.offset_dn else LIN_LOG
+
     def solve(self, recording: Recording) -> Solution:
         span = max(1, min(self.span, len(usable(recording)) // 2))
         note = f"differences over {span} frames"
         width, height = recording.events.size
-        sums = frame_sums(recording, span, self.offset_dn)
+        sums = frame_sums(recording, span, self.logarithm)
         if self.reading == "global":
             theta, sound = _solve(sums.sum((1, 2), keepdims=True))
             return constant((height, width), np.asarray(theta)[:, 0, 0],
@@ -99,16 +103,15 @@ class EccEvents(System):
         return Solution(clipped, ~bad[None] & (clipped == theta), notes=("ratios only",))
 
 
-def frame_sums(recording: Recording, span: int, offset_dn: float = 0.0) -> Array:
+def frame_sums(recording: Recording, span: int, logarithm: Logarithm) -> Array:
     """Normal equations (9, H, W): sums of aa, ab, bb, ad, bd over differences of `span` frames
     (a, b: ON and OFF events, d: dL), number of d that are exactly 0, number of all, and largest
     numbers of ON and OFF events in one."""
-    log = lin_log if offset_dn == 0 else lambda dn: np.log(dn + np.float32(offset_dn))
     width, height = recording.events.size
     sums = jnp.zeros((9, height, width))
     past: collections.deque[tuple[np.ndarray, np.ndarray]] = collections.deque(maxlen=span + 1)
     counts = np.zeros((2, height, width), np.float32)
-    for interval in intervals(recording, log):
+    for interval in intervals(recording, logarithm.of):
         if not interval.continues:
             past.clear()
             counts = np.zeros_like(counts)

@@ -11,7 +11,7 @@ import dataclasses
 
 import numpy as np
 
-from evflow.baselines.reconstruction import Reconstructor, checked, log_of, segments, steps_of
+from evflow.baselines.reconstruction import Reconstructor, checked, segments, steps_of
 from evflow.camera import Camera
 from evflow.types import Events
 
@@ -26,11 +26,11 @@ class Integration(Reconstructor):
     ) -> np.ndarray:
         frames, frame_times, theta, times = checked(events, frames, frame_times, camera, times)
         width, height = events.size
-        state = np.full(height * width, float(log_of(self.start_dn, self.offset_dn)))
+        state = np.full(height * width, float(self.logarithm.of(self.start_dn)))
         images = np.zeros((len(times), height, width), np.float32)
         for part in segments(events, frame_times, times):
             if part.frame >= 0:
-                state = np.asarray(log_of(frames[part.frame], self.offset_dn), np.float64).ravel()
+                state = np.asarray(self.logarithm.of(frames[part.frame]), np.float64).ravel()
             pixel, step = steps_of(events, part.events, theta)
             state = state + np.bincount(pixel, step, state.size)
             images[part.images] = state.reshape(height, width)

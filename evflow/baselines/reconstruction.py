@@ -4,8 +4,7 @@
 
 An image at time t knows the events up to and including t and the frames *before* t: read at a
 frame's own time it is a prediction of that frame. A system is a frozen dataclass of its options.
-Thresholds belong to the log map they were measured in: offset_dn 0 is the lin-log map, as
-everywhere, else log(DN + offset_dn), in calibration and here alike. Host side.
+Thresholds belong to the logarithm they were measured in, in calibration and here alike. Host side.
 """
 
 from __future__ import annotations
@@ -14,47 +13,23 @@ import abc
 import dataclasses
 from collections.abc import Iterator
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
 from evflow.camera import Camera
 from evflow.checks import check_frames, check_times
 from evflow.errors import EvflowDataError
-from evflow.light.log_maps import LINLOG_KNEE, LINLOG_SLOPE, lin_log, lin_log_inverse
+from evflow.light.logarithm import LIN_LOG, Logarithm
 from evflow.types import Events
-
-Array = jax.Array
-
-
-def log_of(dn: ArrayLike, offset_dn: float) -> Array:
-    """Log intensity of DN 0..255: the lin-log map for offset 0, else log(DN + offset)."""
-    return lin_log(dn) if offset_dn == 0 else jnp.log(jnp.asarray(dn, jnp.float32) + offset_dn)
-
-
-def dn_of(log: ArrayLike, offset_dn: float) -> Array:
-    """The inverse of `log_of`; below black it goes on to negative DN."""
-    log = jnp.asarray(log)
-    return lin_log_inverse(log) if offset_dn == 0 else jnp.exp(log) - offset_dn
-
-
-def slope_of(dn: ArrayLike, offset_dn: float) -> Array:
-    """d log / d DN of `log_of`."""
-    dn = jnp.asarray(dn, jnp.float32)
-    if offset_dn:
-        return 1.0 / (dn + offset_dn)
-    return jnp.where(dn <= LINLOG_KNEE, LINLOG_SLOPE, 1.0 / jnp.maximum(dn, LINLOG_KNEE))
 
 
 @dataclasses.dataclass(frozen=True)
 class Reconstructor(abc.ABC):
     """A system that tracks pixels' brightness by events and frames.
 
-    offset_dn: of the log map, see `log_of`. start_dn: initial brightness before the first frame.
+    logarithm: that of the thresholds. start_dn: initial brightness before the first frame.
     """
 
-    offset_dn: float = 0.0
+    logarithm: Logarithm = LIN_LOG
     start_dn: float = 127.5
 
     @abc.abstractmethod
@@ -72,11 +47,11 @@ class Reconstructor(abc.ABC):
         """Intensity (T, H, W) float32 in DN, clipped to 0..255 as a frame is.
 
         frames: (K, H, W) uint8 or float32 DN 0..255, K may be 0; frame_times: (K,) int us, strictly
-        increasing; camera: maps (H, W) in the units of `offset_dn`; times: (T,) int us,
+        increasing; camera: maps (H, W) in the units of `logarithm`; times: (T,) int us,
         non-decreasing. Raises EV002, EV003, EV004, EV007, EV015.
         """
         log = self.log_images(events, frames, frame_times, camera, times)
-        return np.clip(np.asarray(dn_of(log, self.offset_dn)), 0.0, 255.0)
+        return np.clip(np.asarray(self.logarithm.dn(log)), 0.0, 255.0)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -22,6 +22,7 @@ from evflow.camera import PARAMETERS, Camera, Summary
 from evflow.errors import EvflowDataError
 from evflow.estimation.pooled import pool_recording, window_inputs
 from evflow.estimation.unpooled import WINDOW_US
+from evflow.light.logarithm import LIN_LOG, Logarithm
 from evflow.network.architecture import config_of
 from evflow.recordings.windows import iter_windows
 
@@ -127,8 +128,15 @@ def fitted(
         maps = made[name]()[0]
         took = seconds if name == SUMMARY else time.perf_counter() - start
         rows[name] = Fitted(Camera(*(jnp.asarray(m, jnp.float32) for m in maps)),
-                            np.stack([found.valid] * 2), np.median(maps[:2], (1, 2)), took)
+                            np.stack([found.valid] * 2), np.median(maps[:2], (1, 2)), took,
+                            logarithm=logarithm_of(found) if name == SUMMARY else LIN_LOG)
     return rows
+
+
+def logarithm_of(found: CameraEstimate) -> Logarithm:
+    """That of an estimate's thresholds: of the light that its frames lack, too."""
+    return Logarithm(found.optics.offset_dn,
+                     "log_eps" if found.sensor.log_map == "log_eps" else "linlog")
 
 
 def rates(params: Any, recording: Recording) -> dict[str, np.ndarray]:

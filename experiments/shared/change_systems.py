@@ -1,6 +1,7 @@
 """Intensity changes of one recording by every system, scored against its frames (Table XI).
 
-All systems know the same thresholds, those that `estimate_camera` finds, and answer alike: the
+All systems know the thresholds that `estimate_camera` finds, the filters with the light that it
+measures, the encoder, which was trained on ideal pixels, those of such; and answer alike: the
 change of their state since a frame was taken in. "next": up to the next frame, the paper's
 protocol; the encoder and the published filter see that frame, which makes it easy for them.
 "middle": up to the middle one of three frames, when only the outer two are known: no system sees
@@ -21,29 +22,33 @@ from evflow.baselines.akf import Akf
 from evflow.baselines.base import usable
 from evflow.baselines.complementary import Complementary
 from evflow.baselines.integration import Integration
-from evflow.baselines.reconstruction import Reconstructor, dn_of
+from evflow.baselines.reconstruction import Reconstructor
 from evflow.camera import Camera, Summary
 from evflow.estimation.pooled import window_inputs
 from evflow.light.log_maps import lin_log
+from evflow.light.logarithm import LIN_LOG, Logarithm
 from evflow.types import Window
+from experiments.shared.alone import logarithm_of
 
 LOG_255 = float(np.log(255.0))
 PARTS = 16  # instants between two frames
 FILTERS: dict[str, Reconstructor] = {
     "integration": Integration(), "complementary": Complementary(),
     "AKF, latest frame": Akf(reference="latest"), "AKF": Akf(),
-    "AKF, published log and .1": Akf(offset_dn=255.0)}
+    "AKF, published log and .1": Akf(logarithm=Logarithm(255.0, "log"))}
 PUBLISHED = 0.1  # threshold of the published filter, in its own log map
 Changes = dict[str, np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scene:
-    """A recording, its estimated camera and summary, and the true log video (K, PARTS + 1, H, W)
-    from each frame to the next, where there is one. good: usable intervals."""
+    """A recording, its estimated camera and the logarithm of that camera's thresholds, the summary
+    of its pixels taken for ideal, and the true log video (K, PARTS + 1, H, W) from each frame to
+    the next, where there is one. good: usable intervals."""
 
     recording: Recording
     camera: Camera
+    logarithm: Logarithm
     summary: Summary
     good: list[int]
     video: np.ndarray | None = None
@@ -62,10 +67,10 @@ class Predicted:
 
 
 def make_scene(params: Any, recording: Recording, video: np.ndarray | None = None) -> Scene:
-    """The scene, with the thresholds of pixels taken for ideal: a filter adds events to frames as
-    they are, not to the light behind a low-pass."""
-    found = estimate_camera(recording, params, pixel="ideal")
-    return Scene(recording, found.camera, found.summary, usable(recording), video)
+    """The scene, with its camera measured both ways."""
+    found, ideal = (estimate_camera(recording, params, pixel=p) for p in ("measured", "ideal"))
+    return Scene(recording, found.camera, logarithm_of(found), ideal.summary, usable(recording),
+                 video)
 
 
 def next_frame(scene: Scene, params: Any) -> Iterator[Predicted]:
@@ -120,13 +125,14 @@ def _states(scene: Scene, name: str, kept: np.ndarray, times: np.ndarray) -> np.
     """Lin-log states (T, H, W) of a filter that is given the frames `kept`."""
     system, recording = FILTERS[name], scene.recording
     frames = np.stack([recording.frame_dn(int(i)) for i in kept])
-    camera = Camera.constant(scene.camera.shape, PUBLISHED, PUBLISHED) if (
-        system.offset_dn) else scene.camera
+    camera = Camera.constant(scene.camera.shape, PUBLISHED, PUBLISHED)
+    if system.logarithm == LIN_LOG:
+        camera, system = scene.camera, dataclasses.replace(system, logarithm=scene.logarithm)
     states = system.log_images(
         recording.events, frames, recording.frame_times[kept], camera, times)
-    if system.offset_dn == 0:
+    if system.logarithm == LIN_LOG:
         return states
-    return np.asarray(lin_log(jnp.maximum(dn_of(states, system.offset_dn), 0.0)))
+    return np.asarray(lin_log(jnp.maximum(system.logarithm.dn(states), 0.0)))
 
 
 def _encoded(scene: Scene, params: Any, first: int, last: int) -> np.ndarray:

@@ -36,7 +36,8 @@ def ours(params: Any, recording: Recording) -> dict[str, Fitted]:
     seconds = time.perf_counter() - start
     theta = np.array([float(found.summary.theta_on), float(found.summary.theta_off)])
     return alone.fitted(params, recording, found, seconds, span) | {
-        OURS: Fitted(found.camera, np.stack([found.valid] * 2), theta, seconds)}
+        OURS: Fitted(found.camera, np.stack([found.valid] * 2), theta, seconds,
+                     logarithm=alone.logarithm_of(found))}
 
 
 def flat(recording: Recording, theta: float) -> Fitted:

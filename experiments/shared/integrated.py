@@ -14,6 +14,7 @@ from evflow.baselines import SYSTEMS
 from evflow.baselines.base import usable
 from evflow.baselines.integration import Integration
 from evflow.camera import Camera, Summary
+from evflow.light.logarithm import LIN_LOG, Logarithm
 from experiments.shared import alone
 from experiments.shared.images import SCORES, mean_ci, score
 
@@ -59,11 +60,11 @@ def calibrated_and_scored(case: Case, held_out: bool) -> tuple[Recording, Case, 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Thresholds:
-    """A camera to integrate with (None: no events at all), its log map's offset, and for how many
-    seconds it was sought (None: it was not)."""
+    """A camera to integrate with (None: no events at all), the logarithm of its thresholds, and for
+    how many seconds it was sought (None: it was not)."""
 
     camera: Camera | None
-    offset_dn: float = 0.0
+    logarithm: Logarithm = LIN_LOG
     seconds: float | None = None
 
 
@@ -75,8 +76,7 @@ def thresholds(
     found = {"no events": Thresholds(None), "default .2": Thresholds(Camera.constant(shape))}
     for name in systems:
         fitted = SYSTEMS[name].fit(part)
-        found[name] = Thresholds(fitted.camera, getattr(SYSTEMS[name], "offset_dn", 0.0),
-                                 fitted.seconds)
+        found[name] = Thresholds(fitted.camera, fitted.logarithm, fitted.seconds)
     start = time.perf_counter()
     ours = estimate_camera(part, params)
     seconds = time.perf_counter() - start
@@ -84,7 +84,7 @@ def thresholds(
               for name, fitted in alone.fitted(params, part, ours, seconds).items()
               if name != alone.SUMMARY}
     for name, camera in (("summary", constant(shape, ours.summary)), ("maps", ours.camera)):
-        found[f"ours, {name}"] = Thresholds(camera, ours.optics.offset_dn, seconds)
+        found[f"ours, {name}"] = Thresholds(camera, alone.logarithm_of(ours), seconds)
     if case.truth is not None and case.nominal is not None:
         found["true, nominal"] = Thresholds(constant(shape, case.nominal))
         found["true, maps"] = Thresholds(case.truth)
@@ -116,7 +116,7 @@ def image(recording: Recording, span: tuple[int, int], by: Thresholds) -> np.nda
         return frame
     t0, t1 = (int(recording.frame_times[i]) for i in span)
     events = recording.events.slice(t0 + 1, t1 + 1)
-    return Integration(by.offset_dn).reconstruct(
+    return Integration(by.logarithm).reconstruct(
         events, frame[None], np.array([t0]), by.camera, np.array([t1]))[0]
 
 

@@ -14,6 +14,8 @@ from evflow import Recording
 from evflow.baselines import System
 from evflow.baselines.base import intervals, usable
 from evflow.errors import EvflowDataError
+from evflow.light.log_maps import lin_log
+from evflow.light.logarithm import LIN_LOG, Logarithm
 from experiments.shared.compared import POLARITIES
 from experiments.shared.fits import all_fits
 
@@ -38,11 +40,30 @@ def halves(recording: Recording) -> tuple[Recording, Recording]:
     return first, second
 
 
-def changes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """ON and OFF events (N, 2, H, W) and log changes (N, H, W) between usable frames, blurred."""
-    parts = [(p.counts, p.after - p.before) for p in intervals(recording)]
-    n, d = (np.stack(x) for x in zip(*parts, strict=True))
-    return np.stack([[blurred(c) for c in pair] for pair in n]), np.stack([blurred(x) for x in d])
+@dataclasses.dataclass(frozen=True, eq=False)
+class Changes:
+    """Between the usable frames of a recording: counts (N, 2, H, W) of ON and OFF events; before
+    (N, H, W), DN; and changes (N, H, W), lin-log and blurred."""
+
+    counts: np.ndarray
+    before: np.ndarray
+    seen: np.ndarray
+
+    def left(self, on: np.ndarray, off: np.ndarray, logarithm: Logarithm) -> np.ndarray:
+        """What thresholds (H, W), added to the frames in their own logarithm, leave of the changes
+        (N, H, W): measured in lin-log, for all systems alike."""
+        state = logarithm.of(self.before) + carried(self.counts, on, off)
+        predicted = np.clip(np.asarray(logarithm.dn(state)), 0.0, 255.0)
+        made = np.asarray(lin_log(predicted)) - np.asarray(lin_log(self.before))
+        return self.seen - np.stack([blurred(image) for image in made])
+
+
+def changes(recording: Recording) -> Changes:
+    """Those of a recording."""
+    parts = [(p.counts, p.before, p.after) for p in intervals(recording, np.asarray)]
+    n, before, after = (np.stack(x) for x in zip(*parts, strict=True))
+    seen = np.asarray(lin_log(after)) - np.asarray(lin_log(before))
+    return Changes(n, before, np.stack([blurred(image) for image in seen]))
 
 
 def blurred(image: np.ndarray) -> np.ndarray:
@@ -59,25 +80,26 @@ def held_out(
 ) -> dict[str, Any]:
     """Each system's thresholds from the first half, and how well they predict the second:
     residual over the change, root mean squares, of pixels that changed; `frame regression` is
-    fitted to the second half itself and bounds what two numbers can do."""
+    fitted to the second half itself and bounds what two numbers can do in lin-log."""
     first, second = halves(recording)
-    n, d = changes(second)
-    used = np.abs(d) > CHANGED
+    found = changes(second)
+    used = np.abs(found.seen) > CHANGED
+    n = np.stack([[blurred(c) for c in pair] for pair in found.counts])
     design = np.stack([n[:, 0][used], -n[:, 1][used]], -1).astype(np.float64)
     start = time.perf_counter()
-    best, *_ = np.linalg.lstsq(design, d[used].astype(np.float64), rcond=None)
+    best, *_ = np.linalg.lstsq(design, found.seen[used].astype(np.float64), rcond=None)
     seconds = time.perf_counter() - start
-    size = float(np.sqrt(np.mean(d[used] ** 2)))
+    size = float(np.sqrt(np.mean(found.seen[used] ** 2)))
 
-    def left(on: np.ndarray, off: np.ndarray) -> float:
-        rest = d - carried(n, on, off)
-        return float(np.sqrt(np.mean(rest[used] ** 2)) / size)
+    def left(on: np.ndarray, off: np.ndarray, logarithm: Logarithm) -> float:
+        return float(np.sqrt(np.mean(found.left(on, off, logarithm)[used] ** 2)) / size)
 
-    result = {"frame regression": {"theta": best.tolist(), "left": left(*(np.full(
-        d.shape[1:], t, np.float32) for t in best)), "seconds": seconds, "notes": [
+    on, off = (np.full(found.seen.shape[1:], t, np.float32) for t in best)
+    result = {"frame regression": {
+        "theta": best.tolist(), "left": left(on, off, LIN_LOG), "seconds": seconds, "notes": [
             f"{used.sum()} changes of {len(usable(second))} frame intervals"]}}
     for name, fit in all_fits(params, first, systems).items():
-        maps = (np.asarray(getattr(fit.camera, f"theta_{p}")) for p in POLARITIES)
-        result[name] = {"theta": fit.theta.tolist(), "left": left(*maps),
+        on, off = (np.asarray(getattr(fit.camera, f"theta_{p}")) for p in POLARITIES)
+        result[name] = {"theta": fit.theta.tolist(), "left": left(on, off, fit.logarithm),
                         "seconds": fit.seconds, "notes": list(fit.notes)}
     return result

@@ -12,6 +12,7 @@ from evflow.baselines.akf import Akf, since_last
 from evflow.baselines.integration import Integration
 from evflow.camera import Camera
 from evflow.errors import EvflowDataError
+from evflow.light.logarithm import Logarithm
 from evflow.types import Events
 
 SIZE = (6, 5)  # width, height
@@ -149,7 +150,7 @@ def loop(
 def test_equals_a_loop_in_float64(reference: str, offset: float) -> None:
     events, (frames, frame_times), eye = stream(0), shown(1), camera(2)
     times = T0 + np.array([0, 9_000, 10_000, 10_001, 30_000, 30_000, 44_444, 70_000, 85_000])
-    akf = Akf(offset_dn=offset, reference=reference)
+    akf = Akf(logarithm=Logarithm(offset, "log" if offset else "linlog"), reference=reference)
     found = akf.log_images(events, frames, frame_times, eye, times)
     expected = loop(events, frames, frame_times, eye, times,
                     between=reference == "between", offset=offset)

@@ -11,12 +11,14 @@ import pytest
 
 from evflow import Recording
 from evflow.baselines import SYSTEMS
+from evflow.light.log_maps import lin_log
+from evflow.light.logarithm import Logarithm
 from evflow.types import Events
 from experiments import compare_systems
 from experiments.compare_systems import Options
 from experiments.shared import alone
 from experiments.shared.compared import CONSTANT, KNOWN, OURS
-from experiments.shared.second_half import halves
+from experiments.shared.second_half import Changes, blurred, halves
 
 
 def test_halves_share_a_frame_and_no_event() -> None:
@@ -30,6 +32,22 @@ def test_halves_share_a_frame_and_no_event() -> None:
     assert first.frame_times[-1] == second.frame_times[0] == 100_000
     assert first.events.t[-1] < 100_000 <= second.events.t[0]
     assert len(first.events) + len(second.events) == len(events)
+
+
+def test_thresholds_predict_frames_in_the_logarithm_they_were_measured_in() -> None:
+    """Of pixels that see 20 DN more than the frames show: right ones leave next to nothing, in
+    lin-log of the frames, and in another logarithm most of the change."""
+    before = np.linspace(30, 90, 48).reshape(6, 8).astype(np.float32)
+    after = 0.5 * (before + 20) - 20 + np.float32(6)
+    counts = np.zeros((2, 6, 8), np.float32)
+    counts[1] = np.log((before + 20) / (after + 20)) / 0.01
+    seen = np.asarray(lin_log(after)) - np.asarray(lin_log(before))
+    found = Changes(counts[None], before[None], blurred(seen)[None])
+    theta = np.full((6, 8), 0.01, np.float32)
+    right, wrong = (np.abs(found.left(theta, theta, Logarithm(dn))).mean() for dn in (20.0, 0.0))
+    size = np.abs(found.seen).mean()
+    assert right < 1e-3 * size
+    assert wrong > 0.2 * size
 
 
 @pytest.mark.slow

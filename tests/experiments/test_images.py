@@ -11,6 +11,7 @@ import pytest
 
 from evflow import estimate_camera
 from evflow.camera import Camera
+from evflow.light.logarithm import LIN_LOG, Logarithm
 from evflow.types import Events, Recording
 from experiments import changes, integrate
 from experiments.shared import integrated, integrated_pages
@@ -85,9 +86,10 @@ def test_our_thresholds_are_of_the_light_that_was_measured_with_them(
     monkeypatch.setattr(integrated.alone, "fitted", lambda *_: {})
     case = integrated.Case("ramp", "", recording)
     found = integrated.thresholds(case, recording, None, ("ecc offset 40",))
-    assert {name: one.offset_dn for name, one in found.items()} == {
-        "no events": 0.0, "default .2": 0.0, "ecc offset 40": 40.0,
-        "ours, summary": 12.0, "ours, maps": 12.0}
+    measured = Logarithm(12.0)
+    assert {name: one.logarithm for name, one in found.items()} == {
+        "no events": LIN_LOG, "default .2": LIN_LOG, "ecc offset 40": Logarithm(40.0, "log"),
+        "ours, summary": measured, "ours, maps": measured}
 
 
 def test_spans_end_at_the_first_frame_after_so_many_events() -> None:
