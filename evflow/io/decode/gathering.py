@@ -177,7 +177,8 @@ class Gathering:
         if t[i] < before and not self.lateness:
             if ahead:
                 self.last = int(t[i - ahead - 1]) if i > ahead else self.first
-            fix = late.advice(t, i, before, self._turns(chunk), self.joint is not None)
+            fix = late.advice(t, i, before, self._turns(chunk), self.joint is not None,
+                              late.sorted_by(chunk))
             return EvflowDataError(
                 "EV004", f"{self.path}: time goes back from {before:,} to {t[i]:,} us at {spot}"
                 f"{self.so_far()}", fix + self.sound_part(), where=self.path)

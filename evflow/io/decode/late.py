@@ -8,6 +8,7 @@ cases as far as it looks ahead; `order` sorts; a `Joint` appends one clock to th
 
 from __future__ import annotations
 
+import itertools
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator
 
@@ -21,6 +22,7 @@ LOOK = 1 << 16  # events examined after the first that goes back
 WRAPS = 1 << 32, 1 << 31  # us: where times of 32 bits, or 31 and a sign, begin anew
 NEAR_WRAP = 1 / 64  # of it: a step back that is smaller by no more than this is a wrap
 SAWS, SAW = 3, 0.25  # falls that make a sawtooth; how near to its ends, as a share of its height
+MOST_LATE = 0.1  # share of events out of order, above which they are no late ones
 FEW = 16  # at most this many events ahead of all later ones count as wrong
 
 
@@ -41,23 +43,43 @@ def ahead_of(t: np.ndarray, i: int) -> int:
     return ahead if ahead <= FEW and ahead < behind else 0
 
 
+def sorted_by(chunk: Chunk) -> str:
+    """"pixel" or "polarity" if the events are in that order, of more than one; else ""."""
+    for rank, name in ((chunk.p, "polarity"), (chunk.x, "pixel"), (chunk.y, "pixel")):
+        for one, other in itertools.permutations((rank[1:], rank[:-1])):
+            if (one >= other).all() and rank[0] != rank[-1]:
+                return name
+    return ""
+
+
 def advice(
-    t: np.ndarray, i: int, before: int, turns: tuple[int, ...] = (), join: bool = False
+    t: np.ndarray, i: int, before: int, turns: tuple[int, ...] = (), join: bool = False,
+    by: str = "",
 ) -> str:
     """What it means that t[i] is smaller than `before`, its predecessor, and what to do. turns:
     after how many us the stored numbers begin anew, beside `WRAPS`; join: whether clocks are
-    joined, of which this is none."""
+    joined, of which this is none; by: as of `sorted_by`."""
+    if by:
+        return (f"The events are in order of their {by}, and not of time. Sort them: --late sort "
+                "(late='sort')")
     step = before - int(t[i])
+    lasting = step > RESET_US and not (t[i : i + LOOK] >= before).any()
     if step <= RESET_US and _turn(step, turns):
         return ("The stored integers begin anew, as they have too few bits: write them as 64-bit "
                 "ones, np.unwrap(t.astype(np.int64), period=2**bits)")
+    near = t[max(i - LOOK, 0) : i + LOOK]
+    late = len(near) - len(longest(near))
+    if late > MOST_LATE * len(near) and not (join or lasting or _sawtooth(t)):
+        return ("The events are not in order of time: newest first, or by pixel? Sort them: "
+                "--late sort (late='sort'). Two recordings, one behind the other? Write each "
+                "to a file of its own")
     if ahead := ahead_of(t, i):
         return (f"The {ahead} events before it are ahead of all later ones: damaged times? Leave "
                 "them out: --late drop (late='drop')")
     if _sawtooth(t):
         return ("Times begin anew again and again: are they relative to their packet or frame? Add "
                 "the time at which each of these begins; sorting would mix them")
-    if step > RESET_US and not (t[i : i + LOOK] >= before).any():
+    if lasting:
         if _turn(step, (*WRAPS, *turns)):
             return ("Times of 32 bits that begin anew? Write them as 64-bit integers, or continue "
                     "them, without frames: --late join (late='join')")
@@ -136,8 +158,10 @@ class Dropped:
     def notes(self) -> tuple[Note, ...]:
         if not self.count:
             return ()
+        many = (": so many are not late, but never were in order; --late sort keeps them"
+                if self.count > MOST_LATE * self.seen else "")
         return (Note("events.late", f"{self.count:,} of {self.seen:,} events whose time goes back, "
-                     "or lies ahead of what follows, were left out (--late drop)"),)
+                     f"or lies ahead of what follows, were left out (--late drop){many}"),)
 
 
 def longest(t: np.ndarray, least: float | None = None) -> np.ndarray:

@@ -147,6 +147,24 @@ def test_the_message_fits_the_cause_and_its_advice_works(
         assert len(advised(path)) >= 3
 
 
+@each
+@pytest.mark.parametrize("order", ["newest first", "by pixel", "by polarity"])
+def test_what_never_was_in_order_is_to_be_sorted(tmp_path: Path, kind: str, order: str) -> None:
+    """To leave out late events would leave next to nothing: it is not advised, and said if done."""
+    columns = table(T)
+    by = {"newest first": -T, "by pixel": columns["x"], "by polarity": columns["p"]}[order]
+    rank = np.argsort(by, kind="stable")
+    path = FILES[kind](tmp_path, {name: column[rank] for name, column in columns.items()})
+    if kind != "bag":  # whose chunks show two events at a time
+        fix = refused(path).fix
+        assert "--late sort" in fix
+        assert "--late drop" not in fix
+    assert len(read_events(path, late="sort")) == len(T)
+    got = read_recording(path, late="drop")
+    assert len(got.events) < 0.9 * len(T)
+    assert "never were in order; --late sort keeps them" in got.notes[0].text
+
+
 def test_a_first_event_far_ahead_is_no_other_clock(tmp_path: Path) -> None:
     for kind in ("npz", "text"):
         path = FILES[kind](tmp_path, table(changed(_0=10**15)))
@@ -158,7 +176,7 @@ def test_a_first_event_far_ahead_is_no_other_clock(tmp_path: Path) -> None:
 
 def test_a_step_back_that_is_not_joined_is_said_to_be_none(tmp_path: Path) -> None:
     path = npz(tmp_path, table(np.concatenate([T[:600], T[:600]])))
-    assert "overtaken? Leave" in refused(path).fix
+    assert "Two recordings, one behind the other?" in refused(path).fix
     assert "more than 1 s for another clock, and this is one of 0.599 s" in refused(
         path, late="join").fix
 
