@@ -20,6 +20,8 @@ from evflow.notes import Note
 
 POLARITIES = ("auto", "01", "pm1", "invert")
 LATE = ("stop", "drop", "sort", "join")
+# What a damaged file can show: events before that are read with `partial`.
+FORGIVEN = ("EV003", "EV004", "EV005", "EV006", "EV007", "EV009")
 
 
 def check_choices(options: Any, **choices: tuple[str, ...]) -> None:
@@ -214,7 +216,7 @@ class Hints:
     def forgive(self, error: EvflowDataError, sound: bool) -> Note:
         """A note on the error if reading what is sound before the damage was requested and there is
         something; else the error is raised."""
-        if not (self.partial and sound and error.code in ("EV004", "EV009")):
+        if not (self.partial and sound and error.code in FORGIVEN):
             raise error
         return Note("events.partial",
                     f"only the part before the damage was read (--partial): {error.seen}")

@@ -367,7 +367,7 @@ TABLES: dict[tuple[str, str], Callable[[], dict[str, Figures]]] = {
     ("README.md", "## Accuracy"): readme,
     (ACCURACY, "## `estimate_camera` on held-out"): evaluate,
     (ACCURACY, "### Intervals"): intervals,
-    (ACCURACY, "### Cameras and scenes"): others,
+    (ACCURACY, "### Other cameras and other scenes"): others,
     (ACCURACY, "### What the frames cost"): true_video,
     (ACCURACY, "### How the error falls"): curves,
     (ACCURACY, "### When one polarity"): one_polarity,

@@ -38,7 +38,8 @@ def table_three() -> dict[str, Figures]:
 
 
 def table_four() -> dict[str, Figures]:
-    rows = {"V2E": "v2e", "DVS-Voltmeter": "evolt", "paper's flow": "ours"}
+    rows = {"V2E": "v2e", "DVS-Voltmeter |": "evolt", "the same, given": "evolt, θ",
+            "paper's flow": "ours"}
 
     def of(system: str, sensor: str, head: str) -> Figures:
         row = rf"{sensor}\|flat .*?\|{system}\|"

@@ -18,6 +18,7 @@ from evflow.files.spool import Spool
 from evflow.io.decode import late, written
 from evflow.io.decode.causes import why_no_polarity, why_outside
 from evflow.io.decode.chunk import Chunk
+from evflow.io.decode.possible import first_odd, possible_times
 from evflow.io.decode.units import UNITS_US, check_whole
 from evflow.io.hints import Hints, dropped, within
 from evflow.notes import Note
@@ -48,7 +49,21 @@ class Gathering:
         self.lateness = late.Lateness() if hints.late == "sort" else None
 
     def add(self, chunk: Chunk) -> bool:
-        """Keep what lies in the range; True if the rest of the file lies after it."""
+        """Keep what lies in the range; True if the rest lies after it, or is not to be read."""
+        if self.hints.partial and (odd := first_odd(chunk, self._unit)):
+            i, name = odd
+            error = self._odd(chunk, name, i)
+            if not (i and self._add(chunk.only(np.arange(i)))):
+                self.notes.append(self.hints.forgive(error, self.kept > 0))
+            return True
+        return self._add(chunk)
+
+    @property
+    def _unit(self) -> str:
+        """Of the file's times."""
+        return self.native if self.hints.time_unit == "auto" else self.hints.time_unit
+
+    def _add(self, chunk: Chunk) -> bool:
         t = self._times(chunk)
         x, y, p = (self._whole(chunk, name) for name in ("x", "y", "p"))
         if p.dtype != bool:  # its convention is decided when all values are known
@@ -63,13 +78,15 @@ class Gathering:
         return self._unsorted(chunk, t) if self.lateness else self._sorted(chunk, t)
 
     def _times(self, chunk: Chunk) -> np.ndarray:
-        if chunk.t.dtype.kind == "f" and not (fits := np.abs(chunk.t) < 2.0**63).all():
+        fits = possible_times(chunk.t, self._unit)
+        alone = self.hints.time_unit == "auto" and (self.seen or fits[0])
+        huge = chunk.t.dtype.kind == "f" and not (np.abs(chunk.t) < 2.0**63).all()
+        if huge or (alone and not fits.all()):
             raise self._odd(chunk, "t", int(np.argmin(fits)))
-        unit = self.native if self.hints.time_unit == "auto" else self.hints.time_unit
         if self.hints.time_unit == "auto":
             check_whole(
                 chunk.t, self.native, math.prod(self.size) if self.size else chunk.area())
-        written.seen(chunk.t, unit, self.native)
+        written.seen(chunk.t, self._unit, self.native)
         t = self.hints.microseconds(chunk.t, self.native, self.offset)
         t = self.joint(t) if self.joint else t
         if not self.clocked:
@@ -151,11 +168,13 @@ class Gathering:
         code = "EV007" if not np.isfinite(value) else "EV006" if name == "p" else "EV003"
         fix = {"t": "Times must be seconds or integers: export the file again.",
                "p": why_no_polarity(chunk.p)}
+        if name == "t" and np.isfinite(value):
+            fix["t"] = "A damaged time? Copy the file again."
         place = self._place(chunk, i) + self.so_far(chunk, i)
         return EvflowDataError(
             code, f"{self.path}: {name} is {value} at {place}",
-            fix.get(name, "Were they undistorted? Use the raw integer pixel "
-                    "ones."), where=self.path)
+            fix.get(name, "Were they undistorted? Use the raw integer pixel ones.")
+            + (" Read what comes before: --partial." if self.seen or i else ""), where=self.path)
 
     def _first_outside(self, chunk: Chunk, begin: int, end: int) -> int:
         """Index after `begin` of the first event outside the sensor; the length if there is
@@ -192,8 +211,7 @@ class Gathering:
     def _turns(self, chunk: Chunk) -> tuple[int, ...]:
         """After how many us times of so few bits as those of the chunk begin anew."""
         kind = chunk.t.dtype
-        unit = self.native if self.hints.time_unit == "auto" else self.hints.time_unit
-        return (round(2 ** (8 * kind.itemsize) * UNITS_US[unit]),) if (
+        return (round(2 ** (8 * kind.itemsize) * UNITS_US[self._unit]),) if (
             kind.kind in "iu" and kind.itemsize < 8) else ()
 
     def _narrow(self, chunk: Chunk) -> None:

@@ -23,6 +23,7 @@ WRAPS = 1 << 32, 1 << 31  # us: where times of 32 bits, or 31 and a sign, begin 
 NEAR_WRAP = 1 / 64  # of it: a step back that is smaller by no more than this is a wrap
 SAWS, SAW = 3, 0.25  # falls that make a sawtooth; how near to its ends, as a share of its height
 MOST_LATE = 0.1  # share of events out of order, above which they are no late ones
+SURE = 64  # events, which by chance are in order of their pixel or polarity in no recording
 FEW = 16  # at most this many events ahead of all later ones count as wrong
 
 
@@ -44,7 +45,9 @@ def ahead_of(t: np.ndarray, i: int) -> int:
 
 
 def sorted_by(chunk: Chunk) -> str:
-    """"pixel" or "polarity" if the events are in that order, of more than one; else ""."""
+    """"pixel" or "polarity" if the events, SURE or more, are in that order; else ""."""
+    if len(chunk.t) < SURE:
+        return ""
     for rank, name in ((chunk.p, "polarity"), (chunk.x, "pixel"), (chunk.y, "pixel")):
         for one, other in itertools.permutations((rank[1:], rank[:-1])):
             if (one >= other).all() and rank[0] != rank[-1]:
