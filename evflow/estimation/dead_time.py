@@ -22,6 +22,9 @@ STEP = 1.03  # ratio of successive candidates
 ABOVE, BELOW = (1.0, 1.1), (0.8, 0.95)  # relative ranges with many, few intervals
 ENOUGH = 200  # intervals just above
 SHARP = 8.0  # ratio of densities above and below; a slow pixel's only double over this distance
+# The shortest intervals of a busy scene become many by degrees: 5 to 7 times as many at the edge as
+# below, and again a quarter further on. An edge exceeds that growth.
+FURTHER, GROWTH = (1.25, 1.375), 4.0
 PILED, ROUNDED_US = 0.005, 2.0  # spread at the edge of events that waited for it, as v2e's do
 # Where events are dropped, intervals are as many right behind the dead time as further on; where a
 # pixel begins anew they become many only with the time that a threshold takes. The distance of the
@@ -66,7 +69,8 @@ def dead_time(events: Events) -> DeadTime:
 
     sharpness = _sharpness(intervals, edges, ENOUGH)
     best = int(np.argmax(sharpness))
-    if sharpness[best] < SHARP:
+    growth = max(_growth(intervals, float(edges[best])), 1.0)
+    if sharpness[best] < max(SHARP, GROWTH * growth):
         return unknown
     at_edge = slice(*np.searchsorted(intervals, edges[best] * np.array([0.95, 1.1])))
     near = intervals[at_edge]
@@ -92,6 +96,13 @@ def _sharpness(intervals: np.ndarray, edges: np.ndarray, enough: int) -> np.ndar
                  for low, high in (ABOVE, BELOW))
     density = (ABOVE[1] - ABOVE[0]) / (BELOW[1] - BELOW[0])
     return many / (few * density + 1.0) * (many >= enough)
+
+
+def _growth(intervals: np.ndarray, edge: float) -> float:
+    """Ratio of the densities of the sorted intervals further on and right above an edge."""
+    more, many = (np.diff(np.searchsorted(intervals, [edge * low, edge * high]))[0]
+                  / (high - low) for low, high in (FURTHER, ABOVE))
+    return float(more / max(many, 1.0))
 
 
 def _abrupt(near: np.ndarray) -> bool:

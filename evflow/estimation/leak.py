@@ -46,8 +46,17 @@ class Leak:
 
 
 def measured_leak(waits: Waits) -> Leak:
-    """The leak that pixels show while nothing happens near them."""
-    tables = np.concatenate([waits.own, waits.first], 1)
+    """The leak that pixels show while nothing happens near them. Where the waits that began before
+    the observation hide it, as of pixels that moving things left below their memory, which wait for
+    longer than a period, it is that of the others."""
+    found = _measured(np.concatenate([waits.own, waits.first], 1))
+    if found.hz or not waits.first.any():
+        return found
+    return _measured(np.concatenate([waits.own, np.zeros_like(waits.first)], 1))
+
+
+def _measured(tables: Array) -> Leak:
+    """The leak of waits (3, 2 K), own ones and those that began before."""
     used = tables[0] > 0
     seconds, on, off = tables[:, used]
     if on.sum() < LEAST_EVENTS:

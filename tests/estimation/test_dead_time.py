@@ -53,7 +53,8 @@ def test_noise_that_does_not_know_it_does_not_hide_it() -> None:
     wanted(), np.full((PIXELS, EACH), 10_000.0),  # none; a lamp's flicker, or frames
     1000.0 * np.ceil(wanted() / 1000.0),  # times in steps of a millisecond
     np.random.default_rng(3).exponential(4000.0, (PIXELS, EACH)),  # noise
-    np.maximum(wanted(), 800.0)[:, :2]], ids=["none", "flicker", "steps", "noise", "few"])
+    6000.0 * np.random.default_rng(3).random((PIXELS, EACH)) ** 0.07,  # many by degrees
+    np.maximum(wanted(), 800.0)[:, :2]], ids=["none", "flicker", "steps", "noise", "tail", "few"])
 def test_without_an_edge_nothing_is_said(intervals: np.ndarray) -> None:
     whole = np.full((PIXELS, EACH), 1e5) if intervals.shape[1] < EACH else intervals.copy()
     whole[:, :intervals.shape[1]] = intervals

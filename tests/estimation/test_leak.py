@@ -20,15 +20,19 @@ NONE_HOT = np.zeros(SHAPE, bool)
 
 
 def drawn(
-    leak_hz: float, on_hz: float, off_hz: float, seconds: float, running: bool = True, seed: int = 0
+    leak_hz: float, on_hz: float, off_hz: float, seconds: float, running: bool = True,
+    seed: int = 0, behind: float = 0.0,
 ) -> Events:
     """Noise of pixels whose rates differ by a third, their leak by a quarter; every event resets
-    the memory. running: for long before; else since the beginning."""
+    the memory. running: for long before; else since the beginning, with memories up to one
+    threshold below and `behind` thresholds above the signal, if there is such a number."""
     rng, count = np.random.default_rng(seed), SHAPE[0] * SHAPE[1]
     uneven = rng.gamma(9.0, 1.0 / 9.0, count)
     period = np.exp(0.23 * rng.standard_normal(count)) / max(leak_hz, 1e-9)
     t = np.full(count, -3.0 / max(leak_hz, 0.1) if running else 0.0)
     last, active, found = t - running * rng.random(count) * period, np.arange(count), []
+    if behind:
+        last = rng.uniform(-1.0, behind, count) * period
     while len(active):
         wait = rng.exponential(1.0 / np.maximum((on_hz + off_hz) * uneven[active], 1e-9))
         leaks = np.maximum(last[active] + period[active], t[active])
@@ -54,6 +58,15 @@ def test_leak_is_measured_at_a_quarter_at_least(
     assert found.events > 200
     assert found.hz == pytest.approx(leak_hz, rel=0.15)
     assert abs(found.hz - leak_hz) < 2.5 * found.std_hz < 0.25 * leak_hz
+
+
+@pytest.mark.parametrize("behind", [0.5, 0.8, 1.5])
+def test_leak_shows_in_what_follows_where_moving_things_left_memories_behind(behind: float) -> None:
+    """The first leak event of a pixel then comes after up to 1 + behind periods."""
+    events = drawn(0.3, 0.05, 0.05, 10.0, running=False, behind=behind)
+    found = measured_leak(waits_at_rest(events, NONE_HOT, (0, 10_000_000)))
+    assert found.events > 200
+    assert abs(found.hz - 0.3) < 2.5 * found.std_hz < 0.075
 
 
 @pytest.mark.parametrize(("leak_hz", "on_hz", "off_hz", "seconds", "running"), [
