@@ -235,7 +235,8 @@ def check_frames(frames: np.ndarray, size: Size, full_scale: int = 0) -> None:
         raise EvflowDataError("EV003", f"frames have dtype {frames.dtype}.",
                               f"Expected uint8, uint16 or float32 DN.{fix}")
     if frames.shape[1:] != (height, width):
-        swapped = " Swap width and height of size." if frames.shape[1:] == (width, height) else ""
+        swapped = (" Are the frames transposed, or are width and height of size swapped?"
+                   if frames.shape[1:] == (width, height) else "")
         raise EvflowDataError(
             "EV015", f"frames are {frames.shape[2]}x{frames.shape[1]} (width x height) but events "
             f"are {width}x{height}.", f"Both must come from the same sensor, uncropped.{swapped}")

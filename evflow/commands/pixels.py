@@ -86,7 +86,7 @@ class Pixels:
 
     def model(self) -> SensorModel:
         """The pixels' circuit; EV020 if it has no such part."""
-        from evflow.camera.sensors import WITHOUT, known_sensor
+        from evflow.camera.sensors import SENSORS, WITHOUT, known_sensor
         from evflow.simulator.photoreceptor import as_measured
 
         model = (as_measured(*self._circuit())[1] if self._is_measured
@@ -99,8 +99,11 @@ class Pixels:
             given |= {name: getattr(self, name) for name in CHOICES}
         else:
             refuse(self, CHOICES, f"--sensor {self.sensor} has no such choice")
-        refuse(self, [name for name in WITHOUT[model.kind] if given.get(name)],
-               f"--sensor {self.sensor} has no such part; clean, noisy and v2e do")
+        lacking = [name for name in WITHOUT[model.kind] if given.get(name)]
+        have = [name for name, sensor in SENSORS.items()
+                if not set(lacking) & set(WITHOUT[sensor.model.kind])]
+        refuse(self, lacking, f"--sensor {self.sensor} has no such part; "
+               f"{', '.join(have[:-1])} and {have[-1]} do")
         if self.dead_contrast != "auto":
             if model.kind != "v2e" or model.timestamps != "crossing":
                 refuse(self, ("dead_contrast",), f"--sensor {self.sensor} has no such choice")

@@ -42,8 +42,9 @@ def compare(
     Returns:
         A JSON-ready dict, None where a number is undefined.
 
-        size, duration_s, span_us, events (numbers of events); covered: share of the shorter
-        stream's time that is compared, None with span_us; aligned_at: "clock", or
+        size, duration_s, span_us, events (numbers of events); covered, covered_of_longer: share of
+        the shorter stream's time, and of the longer one's, that is compared, None with span_us;
+        aligned_at: "clock", or
         "beginnings" where the streams share hardly any time and the synthetic one was moved by
         shift_us to begin with the real one;
         rate_hz: events per second and pixel, per polarity, and their ratio synthetic / real;
@@ -72,14 +73,16 @@ def compare(
     t0, t1 = span_us or (int(max(real.t[0], moved.t[0])), int(min(real.t[-1], moved.t[-1])) + 1)
     sides = {"real": real.slice(t0, t1), "synthetic": moved.slice(t0, t1)}
     seconds = (t1 - t0) * 1e-6
-    shorter = min(events.duration_us for events in (real, moved))
+    shorter, longer = (
+        min((t1 - t0) / us, 1.0) if us and span_us is None else None
+        for us in sorted(events.duration_us for events in (real, moved)))
     counts = {name: events.count_map().astype(np.float64) for name, events in sides.items()}
     pixels = real.size[0] * real.size[1]
     rates = {name: _per_polarity(c.reshape(2, -1).sum(1) / (seconds * pixels))
              for name, c in counts.items()}
     return {
         "size": list(real.size), "duration_s": seconds, "span_us": [t0, t1],
-        "covered": min((t1 - t0) / shorter, 1.0) if shorter and span_us is None else None,
+        "covered": shorter, "covered_of_longer": longer,
         "aligned_at": "clock" if shift is None else "beginnings", "shift_us": shift or 0,
         "events": {name: len(events) for name, events in sides.items()},
         "rate_hz": {**rates, "ratio": {

@@ -10,12 +10,12 @@ from evflow.report.verdict import RATE, SHAPE, Judged, graded, judge_stream, sen
 SWAPPED = -0.2  # correlation of net events below which the polarity of one is inverted
 APART = (0.25, 0.6)  # Wasserstein distance of intervals, in decades
 FEWEST = 100  # events of a stream below which "alike" is not said
-COVERED = 0.05  # share of the shorter stream's time, the same
+COVERED = 0.05  # share of either stream's time, the same
 RULE_STREAMS = (f"Good (green): rates within a factor {RATE[0]:g}, r of at least {SHAPE[0]:g}, "
                 f"times less than {APART[0]:g} decades apart. Poor (red): beyond a factor "
                 f"{RATE[1]:g}, r below {SHAPE[1]:g}, more than {APART[1]:g} decades apart. At "
                 f"best fair: fewer than {FEWEST} events of one, or less than {COVERED:.0%} of "
-                "the shorter one's time.")
+                "the time of one.")
 TIMES = {"intervals": ("Intervals between a pixel's events", "of a pixel"),
          "neighbours": ("Delays after a neighbour's event", "after a neighbour")}
 ALIKE = {"good": "Alike.", "fair": "Alike in part.", "poor": "Not alike."}
@@ -38,11 +38,14 @@ def judge_streams(numbers: dict[str, Any]) -> list[Judged]:
 
 def _enough(numbers: dict[str, Any]) -> list[Judged]:
     """Whether what is compared can say that the streams are alike."""
-    fewest, share = min(numbers["events"].values()), numbers["covered"]
-    short = share is not None and share < COVERED
+    fewest = min(numbers["events"].values())
+    short = [(who, share) for who, share in (("shorter", numbers["covered"]),
+                                             ("longer", numbers["covered_of_longer"]))
+             if share is not None and share < COVERED]
     if fewest >= FEWEST and not short:
         return []
-    seen = (f"Only {share:.1%} of the shorter stream's time is compared" if short else
+    by_time = short and (short[0][0] == "shorter" or fewest >= FEWEST)
+    seen = (f"Only {short[0][1]:.1%} of the {short[0][0]} stream's time is compared" if by_time else
             f"One of them has {f'only {fewest}' if fewest else 'no'} event{'s' * (fewest != 1)} "
             "in this time")
     return [Judged("fair", "", 1.0, f"{seen}: too little to call them alike.", advice=

@@ -114,7 +114,7 @@ def numbers_of(
     rates = {"real": {"on": 1.0, "off": 1.0}, "synthetic": {
         "on": rate, "off": rate if rate_off is None else rate_off}}
     return {"events": {"real": 1000, "synthetic": 1000}, "covered": 1.0, "net_r": 0.9,
-            "rate_hz": {**rates, "ratio": rates["synthetic"]},
+            "covered_of_longer": 1.0, "rate_hz": {**rates, "ratio": rates["synthetic"]},
             "counts": {"r": {"on": 0.9, "off": 0.9}}, **times}
 
 
@@ -372,3 +372,13 @@ def test_sentences_begin_with_a_capital_but_symbols_stay() -> None:
     seen = ("θ ON is known to 3%.", "η is.", "intervals differ.")
     assert sentences([Judged("good", "", 0.0, words) for words in seen]) == [
         "θ ON is known to 3%.", "η is.", "Intervals differ."]
+
+
+@pytest.mark.parametrize(("share", "verdict"), [(0.004, "Alike in part."), (0.3, "Alike.")])
+def test_a_stream_that_ends_soon_is_not_called_alike(share: float, verdict: str) -> None:
+    """The first 4 ms of a second say nothing of the rest."""
+    numbers = numbers_of(1.0, 1.0, 1.0) | {
+        "aligned_at": "clock", "duration_s": 1.0, "space_time_r": None, "covered_of_longer": share}
+    words = describe_streams(numbers)
+    assert words.startswith(verdict)
+    assert ("0.4% of the longer stream's time" in words) == (share < 0.05)

@@ -121,7 +121,10 @@ def _size(path: Path, found: dict[str, Member]) -> Any:
         member = found.get(name)
         return None if member is None or math.prod(member.shape) > 4 else member.whole()
 
-    return columns.stated_size(small)
+    size = columns.stated_size(small)
+    if size and "frames" in found and found["frames"].shape[1:3] == size and "width" not in found:
+        return size[::-1]  # the larger side was taken for the width, but frames are upright
+    return size
 
 
 def _table(path: Path, found: dict[str, Member]) -> arrays.Table:
