@@ -100,12 +100,12 @@ def calibrate_step(
         good = sound[i] & kept
         if not good.any():
             undetermined.append(name)
-        median, spread, own = camera_wide(theta[i][good], error[i][good])
+        (median, own), (spread, spread_error) = camera_wide(theta[i][good], error[i][good])
         if good.any() and good.sum() < MOST * kept.sum():
             # Those with enough events are the ones that happen to send more.
             own = float(np.hypot(own, np.median(error[i][good])))
         medians.append((median, own))
-        spreads.append(spread)
+        spreads.append((spread, spread_error))
         maps.append(np.where(sound[i], theta[i], median))
         stds.append(np.where(sound[i], error[i], np.hypot(spread, own)))
     eta, eta_std = pixel_and_camera_rates(rest, steps.rest_s, dead)
@@ -181,15 +181,15 @@ def _check_polarity(steps: Steps, framed: bool) -> None:
 
 def _estimate(
     theta: np.ndarray, theta_std: np.ndarray, medians: list[tuple[float, float]],
-    spreads: list[float], eta: np.ndarray, of_eta: tuple[np.ndarray, list[tuple[float, float]]],
+    spreads: list[tuple[float, float]], eta: np.ndarray,
+    of_eta: tuple[np.ndarray, list[tuple[float, float]]],
     valid: np.ndarray, n_events: np.ndarray, hot: np.ndarray, count: int, notes: tuple[Note, ...],
     undetermined: tuple[str, ...],
 ) -> CameraEstimate:
     eta_std, rates = of_eta
-    values = [*(m for m, _ in medians), *(m for m, _ in rates), *spreads]
-    pixels = max(int(valid.sum()), 1)
+    values = [*(m for m, _ in medians), *(m for m, _ in rates), *(m for m, _ in spreads)]
     errors = [*(s for _, s in medians), *(s for _, s in rates),
-              *(s / np.sqrt(2 * pixels) for s in spreads)]
+              *(s for _, s in spreads)]
     return CameraEstimate(
         Camera(*(jnp.asarray(m, jnp.float32) for m in (*theta, *eta))).validate(),
         Camera(*(jnp.asarray(m, jnp.float32) for m in (*theta_std, *eta_std))),

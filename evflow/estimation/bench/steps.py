@@ -26,6 +26,8 @@ THETA_PRIOR, THETA_PRIOR_STD = 0.3, 0.115  # mean and std of U(.1, .5), without 
 THETA_TOP = 2.0
 PASSES = 4
 GOLDEN = 0.6180339887498949
+OUTLIERS = 4.0  # half widths of the distribution beyond which pixels say nothing of the mismatch
+ERROR_OFF = 0.5  # relative error of the pixels' errors, which are of whole counts and few steps
 BIAS = 0.015  # relative error of the median threshold: 1.4 % low on eight simulated benches
 
 
@@ -176,18 +178,25 @@ def _walked(pulled: np.ndarray, variance: np.ndarray, stored: np.ndarray) -> np.
     return scatter
 
 
-def camera_wide(theta: np.ndarray, error: np.ndarray) -> tuple[float, float, float]:
-    """Median, mismatch (spread beyond the pixels' own errors) and the median's std."""
+def camera_wide(
+    theta: np.ndarray, error: np.ndarray
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Median and its std; mismatch (spread beyond the pixels' own errors) and its std."""
     if not len(theta):
-        return THETA_PRIOR, 0.0, THETA_PRIOR_STD
+        return (THETA_PRIOR, THETA_PRIOR_STD), (0.0, 0.0)
     # Counts are small integers, which quantises the thresholds. Each is spread evenly over its
     # error (multiples of the golden ratio fill (0, 1) evenly) for a continuous median.
     phase = np.arange(len(theta)) * GOLDEN % 1.0 - 0.5
     low, median, high = np.quantile(theta + np.sqrt(12.0) * error * phase, (0.1587, 0.5, 0.8413))
     wide = 0.5 * (high - low)
-    spread = np.sqrt(max(wide**2 - np.median(error) ** 2, 0.0))
+    near = np.abs(theta - median) <= OUTLIERS * wide
+    all_, alone = theta[near].var(), (error[near] ** 2).mean()
+    square = max(all_ - alone, 0.0)
+    square_error = np.hypot(all_ * np.sqrt(2.0 / len(theta)), 2.0 * ERROR_OFF * alone)
+    spread = np.sqrt(square)
+    spread_error = square_error / (2.0 * max(spread, np.sqrt(0.5 * square_error), 1e-12))
     own = np.hypot(1.25 * wide / np.sqrt(len(theta)), BIAS * median)
-    return float(median), float(spread), float(own)
+    return (float(median), float(own)), (float(spread), float(spread_error))
 
 
 def camera_rate(
