@@ -351,8 +351,9 @@ def cradle() -> dict[str, Figures]:
              "ECC with an offset": "ecc offset 40", "JAER": "jaer",
              "`estimate_camera`, summary": "ours, summary",
              "`estimate_camera`, maps": "ours, maps"}
-    return {label: values("integrate", rf"{name}\|", "RMSE", 0, "newton_cradle")
-            for label, name in names.items()}
+    found = {label: values("integrate", rf"{name}\|", "RMSE", 0, "newton_cradle")
+             for label, name in names.items()}
+    return found | {"LGAN": values("integrate_lgan", r"lgan\|", "RMSE", 0, "newton_cradle")}
 
 
 def sizes() -> dict[str, Figures]:
