@@ -170,9 +170,9 @@ def real_recordings() -> dict[str, Figures]:
 
 
 def compare_systems() -> dict[str, Figures]:
-    names = {"`estimate_camera` |": "ours", "simulating the scene": "match",
+    names = {"`estimate_camera` |": "ours", "simulating the scene": "match", "JAER": "jaer",
              "the same with the true": "match, true video", "least squares (ECC)": "ecc median",
-             "LGAN": "lgan", "JAER": "jaer", "S2R": "s2r"}
+             "ECC as": "ecc", "LGAN": "lgan", "S2R |": "s2r", "S2R with": "s2r same, per polarity"}
     wanted = [rf"{mismatch}, {length} s" for length in (r"\.2", "1") for mismatch in (.03, .15)]
     return {label: [values("compare_systems", rf"{length} \(\d+\)\|{system}\|", column)[0]
                     for length in wanted for column in (2, 3)] for label, system in names.items()}
@@ -349,8 +349,7 @@ def losses() -> dict[str, Figures]:
 def cradle() -> dict[str, Figures]:
     names = {"no events": "no events", ".2 everywhere": "default .2", "ECC median": "ecc median",
              "ECC with an offset": "ecc offset 40", "JAER": "jaer",
-             "`estimate_camera`, summary": "ours, summary",
-             "`estimate_camera`, maps": "ours, maps"}
+             "`estimate_camera`, summary": "ours, summary", "`estimate_camera`, maps": "ours, maps"}
     found = {label: values("integrate", rf"{name}\|", "RMSE", 0, "newton_cradle")
              for label, name in names.items()}
     return found | {"LGAN": values("integrate_lgan", r"lgan\|", "RMSE", 0, "newton_cradle")}
