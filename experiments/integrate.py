@@ -9,9 +9,8 @@ the better the image. Scored at 1, 5 and 10 frames and after 1e5 and 5e5 events 
 after them): RMSE and PSNR on 0..255, windowed SSIM (Gaussian, sigma 1.5) and ECC's SSIM of one
 window, averaged over images. Thresholds are those of the first half of a recording, images are of
 the second; a system's logarithm is that of its calibration, ours of the light that it measured.
-"ours, maps" is the whole estimate; the set network, the flow and the paper's flow stand beside it
-by themselves. "no events" is the old frame itself. The paper averages over recordings that it names
-only in part.
+"ours, maps" is the whole estimate; the set network and the flows stand beside it by themselves. "no
+events" is the old frame itself. The paper averages over recordings that it names in part.
 """
 
 from __future__ import annotations

@@ -187,7 +187,7 @@ def test_concatenate_refuses_other_order_and_sizes() -> None:
     ({"frame_times": [2, 1]}, "EV004", "go back 1 time"),
     ({"frame_times": [2, 2]}, "EV004", "do not advance"),
     ({"frames": np.full((2, 4, 6), np.nan, np.float32)}, "EV007", "frame 0 has 24 NaN"),
-    ({"frames": np.zeros((2, 6, 4), np.uint8)}, "EV015", "Swap width and height"),
+    ({"frames": np.zeros((2, 6, 4), np.uint8)}, "EV015", "frames transposed"),
     ({"frames": np.zeros((2, 5, 5), np.uint8)}, "EV015", "frames are 5x5"),
     ({"exposure_us": "a"}, "EV020", "exposure_us='a'"),
     ({"full_scale": float("nan")}, "EV020", "full_scale=nan"),

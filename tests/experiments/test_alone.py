@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from evflow.camera.optics import Optics
+from evflow.camera.sensors import SensorModel
+from evflow.light.logarithm import LIN_LOG, Logarithm
 from experiments.shared import alone, compared, evaluated
 
 SHAPE = (4, 6)
@@ -46,11 +49,14 @@ def test_each_estimator_was_timed(monkeypatch: pytest.MonkeyPatch) -> None:
 
     names = (alone.PAPER_FLOW, alone.NETWORK, alone.SUMMARY, alone.WINDOW)
     monkeypatch.setattr(alone, "estimators", lambda *_: dict.fromkeys(names, slow))
-    found: Any = SimpleNamespace(valid=np.ones(SHAPE, bool))
+    found: Any = SimpleNamespace(
+        valid=np.ones(SHAPE, bool), optics=Optics(12.0), sensor=SensorModel(log_map="log_eps"))
     made = alone.fitted({}, None, found, 7.0)  # type: ignore[arg-type]
     assert made.keys() == set(names) - {alone.WINDOW}
     assert 7 > made[alone.PAPER_FLOW].seconds >= 0.01 <= made[alone.NETWORK].seconds
     assert made[alone.SUMMARY].seconds == 7
+    assert made[alone.SUMMARY].logarithm == Logarithm(12.0, "log_eps")
+    assert made[alone.NETWORK].logarithm == LIN_LOG
 
 
 def test_rows_of_evaluate_name_the_estimator_and_lack_what_none_tells() -> None:

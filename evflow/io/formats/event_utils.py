@@ -19,7 +19,7 @@ from evflow.errors import EvflowDataError
 from evflow.io.decode import tables
 from evflow.io.decode.hdf5 import Hdf5Writer
 from evflow.io.decode.hdf5_columns import FILTERS
-from evflow.io.decode.hdf5_search import images_beside
+from evflow.io.decode.hdf5_search import declared_size, images_beside
 from evflow.io.decode.stream import gather
 from evflow.io.hints import Hints
 from evflow.io.images.exposures import KEY, Stamps, stated_by
@@ -98,10 +98,11 @@ def _pixels(image: np.ndarray) -> np.ndarray:
 def _size(
     f: Any, images: Size | None, columns: dict[str, Any]
 ) -> tuple[Size | None, tuple[Note, ...]]:
-    """Size of the sensor: that of the images, unless sensor_resolution differs in either order."""
+    """Size of the sensor: that of the images, unless sensor_resolution differs in either order;
+    without both, what else the file says of it."""
     stated = np.asarray(f.attrs.get("sensor_resolution", ())).ravel()
     if len(stated) < 2 or stated.dtype.kind not in "iuf" or not (stated[:2] > 0).all():
-        return images, ()
+        return images or declared_size(f, f["events"]), ()
     height, width = (int(v) for v in stated[:2])
     if images in ((width, height), (height, width)):
         return images, ()

@@ -106,7 +106,7 @@ def test_mistake_6_shape(sound: Recording) -> None:
     frames = np.swapaxes(sound.frames, 1, 2)
     error = refused(lambda: dataclasses.replace(sound, frames=frames))
     assert error.code == "EV015"
-    assert "Swap width and height" in error.fix
+    assert "frames transposed" in error.fix
 
 
 def test_mistake_7_nan(sound: Recording) -> None:
