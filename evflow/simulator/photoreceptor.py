@@ -27,11 +27,11 @@ from evflow.camera.numbers import is_off
 from evflow.camera.optics import Optics
 from evflow.camera.sensors import LogMap, SensorModel
 from evflow.light.log_maps import lin_log_inverse, log_dn, log_dn_inverse, to_log
+from evflow.light.logarithm import LEAST_DN
 
 Array = jax.Array
 
 FAST = 1e-5  # s: a photoreceptor without visible effect between two fine frames
-LEAST_DN = 0.1  # of light, before the log
 LEAST_LIGHT = 0.02  # of v2e's full rate
 TYPICAL = 0.4  # cutoff of a low-pass proportional to light, in a typical scene, of that at 255 DN
 
