@@ -8,12 +8,14 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from evflow.estimation.refine.denoise import LEAST_DN
 from evflow.estimation.refine.lost_contrast import Lost, lost_contrast
 from evflow.estimation.refine.path import STEPS, Films, Place, as_seen, interpolated, of_place
 from evflow.estimation.refine.readouts import without_readouts
 from evflow.estimation.refine.receptor_data import Part, Sample, sample
 from evflow.estimation.refine.receptor_result import Found
 from evflow.estimation.refine.receptor_search import find
+from evflow.estimation.refine.receptor_smoothed import smoothed
 from evflow.estimation.refine.sightings import sight
 from evflow.estimation.refine.still_noise import hot_ones
 from evflow.estimation.refine.stretches import LARGE, most_simulated, spread
@@ -45,7 +47,7 @@ def receptor_sample(
         films: cache that receives the interpolated runs, if these are few and small.
 
     Returns:
-        The sample; None with too few events.
+        The sample, its path smoothed in time where frames are noisy; None with too few events.
     """
     def parts() -> Iterator[Part]:
         for recording, run in receptor_places(places):
@@ -59,7 +61,8 @@ def receptor_sample(
             del film, s, disturbed, hot
             give_back()
 
-    return sample(parts())
+    data = sample(parts())
+    return smoothed(data) if data is not None and noise_dn >= LEAST_DN else data
 
 
 def find_photoreceptor(
