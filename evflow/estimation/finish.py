@@ -23,6 +23,7 @@ from evflow.estimation.one_polarity import (
     with_prior,
     without_those,
 )
+from evflow.estimation.pixel_noise import beyond_neighbours
 from evflow.estimation.pooled import Quiet, need_shown, quiet_times
 from evflow.estimation.refine import Chunk
 from evflow.estimation.remarks import (
@@ -125,6 +126,7 @@ def estimate(
         quiet.light, leak.rate_hz, scatter(quiet.maps, refined.faulty), SIGNAL_ERROR)
     sent = quiet.at_mean_light() if shot.falls else quiet.maps.copy()
     sent[:, 1, dead] = 0.0  # seconds in which noise could be seen
+    sent = beyond_neighbours(sent, state.sent, state.seconds, hot)
     if shot.falls:
         summary, std = _at_mean_light(summary, std, quiet, leak)
     if state.evidence is not None:

@@ -35,6 +35,8 @@ SHARES = np.linspace(SIGNAL, 1.0, 6)  # of the noise, that follows the threshold
 UNEVEN_ERROR, COUNTS_ERROR = 0.3, 0.15
 PLAIN_THETA, PLAIN_ODDS = 0.1, 1.0  # log units: twice STILL; log odds among pixels above it only
 
+SELDOM = 0.1  # share of the recording: less quiet time does not tell a hot pixel's rate
+BESIDE = 5  # pixels: side of the neighbourhood that sees what a hot pixel does
 AROUND = 9  # pixels: side of the neighbourhood in which other events are counted
 CHANCE = 4.0  # standard deviations of noise allowed around a pixel
 STILL = 0.05  # log units: 3x3 pixels from frame to frame; less than any useful threshold
@@ -132,6 +134,23 @@ def pixel_rates(
     own = hot & (n > 0)
     rate[own], std[own] = n[own] / alone[own], np.sqrt(n[own] + 1.0) / alone[own]
     return rate, std
+
+
+def beyond_neighbours(quiet: Array, sent: Array, seconds: float, hot: Array) -> Array:
+    """quiet (2, 2, H, W) of `quiet_time` with more of hot (H, W) pixels that were seldom quiet, as
+    where the whole scene moves: what they sent beyond the median of their neighbours. Given as the
+    events and seconds of a Poisson count of that rate and its error, which includes the spread of
+    the neighbours. sent (2, H, W): ON and OFF events in all the `seconds`."""
+    found = quiet.copy()
+    for (events, watched), own in zip(found, sent.astype(np.float32), strict=True):
+        seldom = hot & (watched < SELDOM * seconds)
+        usual = cv2.medianBlur(np.where(hot, 0.0, own).astype(np.float32), BESIDE)
+        excess = np.maximum(own - usual, 0.0)[seldom]
+        spread = cv2.medianBlur(np.abs(own - usual), BESIDE)[seldom]
+        variance = own[seldom] + 1.0 + (1.5 * spread) ** 2
+        events[seldom] = excess**2 / variance
+        watched[seldom] = excess / variance * seconds
+    return found
 
 
 def _mean_rate(n: Array, seconds: Array, used: Array) -> float:

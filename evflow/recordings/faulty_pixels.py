@@ -67,10 +67,13 @@ def hot_pixels(
     own = OWN_SHARE * seconds * events / np.maximum(seconds_quiet, 1e-9)
     usual = _median_around(counts)
     stands_out = (counts - _most_of_others(counts, hot) >= own) & (counts > TWICE * usual)
-    # Whether neighbours can show rest.
-    comparable = _around(seconds_quiet) >= QUIET_NEAR * seconds_quiet
+    # Whether neighbours can show rest, and whether it fires while they do: in slow scenes all fire
+    # in quiet times.
+    near = _around(seconds_quiet)
+    comparable = near >= QUIET_NEAR * seconds_quiet
+    alone = events > _restless(others / np.maximum(near, 1e-9) * seconds_quiet)
     return hot & ((usual <= _restless(rate_hz * seconds)) | stands_out
-                  | (lasting & comparable & (at_rest | (fired >= MANY_FIRED))))
+                  | (lasting & comparable & (at_rest | (alone & (fired >= MANY_FIRED)))))
 
 
 def hot_in_stretch(quiet: np.ndarray, counts: np.ndarray, seconds: float) -> np.ndarray:

@@ -174,6 +174,7 @@ def test_a_hot_pixel_does_not_determine_a_threshold(watched: tuple[Recording, Ca
     hot = Events(*(column[order] for column in columns), events.size)
     found = estimate_camera(dataclasses.replace(watched[0], events=hot))
     assert found.hot[9, 7]
+    assert float(found.camera.eta_off[9, 7]) == pytest.approx(500.0, rel=0.1)
     assert found.undetermined == ("theta_off",)
     assert any("theta_on was measured by itself" in note.text for note in found.notes)
 

@@ -12,6 +12,7 @@ from evflow.estimation.maps import with_rates, with_unquiet_error
 from evflow.estimation.pixel_noise import (
     ODD,
     _shapes,
+    beyond_neighbours,
     pixel_rates,
     quiet_time,
     threshold_law,
@@ -246,3 +247,24 @@ def test_rates_are_less_certain_where_little_is_quiet_and_noise_events_are_many(
         np.hypot(0.01, 0.1 * 0.3 / 2 / 2), rel=1e-5)
     assert float(of(1.0, 10.0).eta_on) == pytest.approx(0.01, rel=0.01)
     assert of(0.0, 1e9).theta_on == std.theta_on
+
+
+def test_hot_pixels_before_moving_scenes_have_what_they_send_beyond_their_neighbours() -> None:
+    rng = np.random.default_rng(0)
+    seconds, shape = 2.0, (30, 40)
+    sent = rng.poisson(14.0, (2, *shape)).astype(np.float64)
+    hot = np.zeros(shape, bool)
+    hot[4::8, 4::8] = True
+    sent[0, hot] += rng.poisson(24.0 * seconds, hot.sum())
+    quiet = np.zeros((2, 2, *shape), np.float32)
+    quiet[:, :, 4, 4] = [[9.0, 0.5]] * 2  # often alone: its own
+    found = beyond_neighbours(quiet, sent, seconds, hot)
+    assert (found[:, :, ~hot] == 0.0).all()
+    np.testing.assert_array_equal(found[:, :, 4, 4], quiet[:, :, 4, 4])
+    hot[4, 4] = False
+    rate, std = pixel_rates(*found[0], 0.1, hot, error=0.1)
+    away = (rate[hot] - 24.0) / std[hot]
+    assert abs(away.mean()) < 0.5
+    assert 0.6 < away.std() < 1.4
+    off, off_std = pixel_rates(*found[1], 0.1, hot, error=0.1)
+    assert (off[hot] < 0.1 + 2.5 * np.maximum(off_std[hot], 1.5)).all()

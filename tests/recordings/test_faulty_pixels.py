@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from evflow.estimation.static import estimate_noise
-from evflow.recordings.faulty_pixels import dead_pixels, silent_lines
+from evflow.recordings.faulty_pixels import dead_pixels, hot_pixels, silent_lines
 from evflow.types import Events, Recording
 
 SHAPE = (24, 40)
@@ -65,3 +65,18 @@ def test_noise_of_half_a_sensor_is_that_of_the_half() -> None:
         np.testing.assert_allclose(np.asarray(map_)[:, 20:], float(rate), rtol=0.02)
     assert found.dead[:, 20:].all()
     assert "pixels.dead" in [note.code for note in found.notes]
+
+
+def test_in_slow_scenes_pixels_that_fire_in_quiet_times_are_not_hot() -> None:
+    """In 2 s of slow motion, 60 frame intervals are quiet for each pixel, which sends 3 to 7 events
+    in them and 10 in all. One that sends twice as many is within what scenes do; 12 Hz are not."""
+    quiet = np.zeros((4, *SHAPE))
+    quiet[0] = np.random.default_rng(1).integers(3, 8, SHAPE)
+    quiet[1:3] = np.array([1.5, 60.0])[:, None, None]
+    counts = noise(10.0)
+    for y, x, events in ((8, 8, 11), (8, 30, 21)):
+        quiet[0, y - 2:y + 3, x - 2:x + 3] = 5
+        quiet[0, y, x], counts[y, x] = events, events + 5
+    quiet[3] = quiet[0]
+    hot = hot_pixels(quiet, 0.2, counts, 2.0)
+    assert np.argwhere(hot).tolist() == [[8, 30]]
