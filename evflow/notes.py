@@ -75,6 +75,7 @@ NOTES: dict[str, str] = {
     "scene.static": "nothing moves: only the noise was measured",
     "scene.steps": "the light of the whole view changes in steps",
     "scene.restless": "the light varies when it should be constant",
+    "steps.fast": "large steps of light send fewer events than small ones foretell",
     "steps.slow": "pixels are too slow for the rests between steps",
     "steps.skipped": "steps of the light were left out",
     "theta.guessed": "thresholds depend on a network's guess of the contrast",

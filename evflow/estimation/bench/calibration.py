@@ -19,7 +19,9 @@ from evflow.camera.sensors import LogMap
 from evflow.errors import EvflowDataError
 from evflow.estimation.bench.counting import Span, Steps, counted_steps
 from evflow.estimation.bench.coverage import lost_steps, skipped_notes
+from evflow.estimation.bench.fast_edges import with_fast_edges
 from evflow.estimation.bench.latency import measured_latency
+from evflow.estimation.bench.leaking import measured_leaking
 from evflow.estimation.bench.levels import few_sizes, measured_bench
 from evflow.estimation.bench.logarithm import chosen_map
 from evflow.estimation.bench.rests import LEAST_STEP, rests_between
@@ -82,7 +84,11 @@ def calibrate_step(
     rest = steps.rest
     n_events = steps.counts.sum((0, 1)).astype(np.uint32)
     dead = dead_pixels(n_events)
-    hz, kept = camera_rate(rest, steps.rest_s, dead)
+    up, rests_s = steps.changes > 0, steps.rests_s
+    kept = camera_rate(rest, np.full(2, steps.rest_s), dead)[1]
+    leaking = measured_leaking(recording.events, steps.quiet, up, kept & ~dead)
+    watched_s = np.array([leaking.watched(rests_s, up), steps.rest_s])
+    hz = camera_rate(rest, watched_s, dead)[0]
     strays = steps.seconds[:, None] * hz
     clean = np.maximum(steps.counts - strays[..., None, None], 0.0)
     sized = steps.sized
@@ -90,7 +96,7 @@ def calibrate_step(
     missed = lost_steps(steps.changes, clean[:, :, kept].mean(-1), sized)
     lost = np.broadcast_to(missed[:, None, None], (len(missed), *kept.shape))
     theta, error = (ratio if literal else regression)(
-        steps.levels, clean, strays, fresh, steps.rests.max(1) > 0, lost, steps.lit)
+        steps.levels, clean, strays, fresh, steps.rests, lost, steps.lit, leaking, rests_s)
     events = np.where(lost[:, None], 0.0, steps.counts).sum(0)
     enough = (events >= FEW_EVENTS) & (events > 2 * strays.sum(0)[:, None, None])
     enough &= steps.reach > LEAST_STEP
@@ -108,12 +114,15 @@ def calibrate_step(
         spreads.append((spread, spread_error))
         maps.append(np.where(sound[i], theta[i], median))
         stds.append(np.where(sound[i], error[i], np.hypot(spread, own)))
-    eta, eta_std = pixel_and_camera_rates(rest, steps.rest_s, dead)
+    eta, eta_std = pixel_and_camera_rates(
+        rest, watched_s, dead, leaking.std_hz if leaking.hz else 0.0)
     valid = (sound | ~enough.any((1, 2))[:, None, None]).all(0) & enough.any(0) & kept
     found = _estimate(np.stack(maps), np.stack(stds), medians, spreads, eta, eta_std, valid,
                       n_events, ~kept, int((~missed).sum()),
                       _notes(steps, undetermined, valid, ~kept, dead, missed),
                       tuple(undetermined))
+    found = with_fast_edges(
+        found, steps.changes, clean[:, :, kept].mean(-1), sized & ~missed)
     shown = measured_bench(
         steps.unit, recording.events, steps.spans, steps.settled, steps.quiet, steps.light,
         np.median(steps.levels, (1, 2)), steps.rests, clean, kept, np.where(sound, theta, np.nan),
@@ -123,9 +132,11 @@ def calibrate_step(
             recording.events, triggers_us, steps.spans, steps.settled,
             steps.light, np.median(steps.levels, (1, 2)), kept))
     return dataclasses.replace(
-        found, bench=shown, sensor_std={"refractory_s": shown.dead.std_s},
+        found, bench=shown,
+        sensor_std={"refractory_s": shown.dead.std_s, "leak_hz": leaking.std_hz},
         sensor=dataclasses.replace(
-            found.sensor, refractory_s=shown.dead.seconds, log_map=log_map))
+            found.sensor, refractory_s=shown.dead.seconds, log_map=log_map, leak_hz=leaking.hz,
+            eta_is_all=leaking.hz > 0))
 
 
 def _with_right_map(steps: Steps, sent: np.ndarray) -> tuple[Steps, LogMap]:

@@ -65,9 +65,14 @@ class Steps:
         return self.rests.sum(0, dtype=np.float64)
 
     @property
+    def rests_s(self) -> np.ndarray:
+        """(K+1,) seconds of counting at each rest."""
+        return np.array([b - a for a, b in self.quiet]) * 1e-6
+
+    @property
     def rest_s(self) -> float:
         """Total seconds of counting at rest."""
-        return sum(b - a for a, b in self.quiet) * 1e-6
+        return float(self.rests_s.sum())
 
     @property
     def changes(self) -> np.ndarray:
@@ -110,10 +115,11 @@ def counted_steps(
         levels, lit = _levels(recording, spans, light)
     other = None if framed is None else other_map(levels, framed, bool(lux))
     settled = settled_at(spans, SETTLE_US)
-    noise = noise_us(events, [(a, b) for a, (_, b) in zip(settled, spans, strict=True)])
+    up = np.diff(np.median(levels, (1, 2))) > 0
+    noise = noise_us(events, [(a, b) for a, (_, b) in zip(settled, spans, strict=True)], up)
     inside = covered(events, spans, settled, noise)
     uncovered = len(spans) - len(spans[inside])
-    levels, lit, spans = levels[inside], lit[inside], spans[inside]
+    levels, lit, spans, noise = levels[inside], lit[inside], spans[inside], noise[inside]
     settle, slow = settling_us(events, spans)
     settled = settled_at(spans, settle)
     light = None if light is None else light[inside]
@@ -123,7 +129,9 @@ def counted_steps(
     seconds = [(after - before[1]) * 1e-6
                for before, after in zip(spans, settled[1:], strict=False)]
     rested = [(a, b) for a, (_, b) in zip(settled, spans, strict=True)]
-    quiet = [watched(events, span, noise) for span in rested]
+    fallen = [False, *(np.diff(np.median(levels, (1, 2))) < 0)]
+    quiet = [watched(events, span, every, fallen=bool(fell))
+             for span, every, fell in zip(rested, noise, fallen, strict=True)]
     silent = sum(b - a for a, b in rested) - sum(b - a for a, b in quiet)
     rests = np.stack([events.slice(a, b).count_map() for a, b in quiet])
     busiest = max((events.slice(a, b) for a, b in quiet), key=len)

@@ -22,36 +22,40 @@ LEAST_STEPS = 3  # of a direction: among two it is open which one lacks events
 LOST, LOST_EVENTS = 0.6, 1.0  # share of the predicted events, and events per pixel less than those
 
 
-def noise_us(events: Events, quiet: list[Span]) -> float:
-    """Mean time in us between noise events of the whole sensor without hot pixels: the median over
-    the rests, of their second halves, as slow pixels still answer to a step in the first. Infinite
-    without noise."""
-    halves = [((a + b) // 2, b) for a, b in quiet
-              if b > int(events.t[0]) and (a + b) // 2 < int(events.t[-1])]
+def noise_us(events: Events, quiet: list[Span], up: np.ndarray) -> np.ndarray:
+    """(R,) mean time in us between noise events of the whole sensor without hot pixels, at each of
+    the rests. The median over those after steps of the same direction, as leak comes after rises
+    alone, and of their second halves, as slow pixels still answer to a step in the first. Infinite
+    without noise. up: (R - 1,) bool, the steps between the rests."""
+    halves = [((a + b) // 2, b) for a, b in quiet]
+    inside = np.array([b > int(events.t[0]) and a < int(events.t[-1]) for a, b in halves])
     counts = np.array([events.slice(*half).count_map().sum(0) for half in halves])
-    if not len(counts):
-        return float("inf")
-    kept = ~hot_at_rest(counts.sum(0))
-    rate = float(np.median([n[kept].sum() / max(b - a, 1)
-                            for n, (a, b) in zip(counts, halves, strict=True)]))
-    return 1.0 / rate if rate else float("inf")
+    kept = ~hot_at_rest(counts[inside].sum(0)) if inside.any() else np.ones(counts.shape[1:], bool)
+    rates = counts[:, kept].sum(1) / np.array([max(b - a, 1) for a, b in halves])
+    found = np.full(len(quiet), np.median(rates[inside]) if inside.any() else 0.0)
+    for alike in (np.concatenate([[False], up == side]) for side in (True, False)):
+        if (alike & inside).any():
+            found[alike] = np.median(rates[alike & inside])
+    found[0] = found.min()  # what was before it is not known
+    return np.divide(1.0, found, out=np.full(len(found), np.inf), where=found > 0)
 
 
-def covered(events: Events, spans: list[Span], settled: list[int], noise: float) -> slice:
+def covered(
+    events: Events, spans: list[Span], settled: list[int], noise: np.ndarray
+) -> slice:
     """Those of the rests between which the events are complete.
 
     Args:
         events: of the recording.
         spans: the R rests.
         settled: (R,) times until which events belong to the step that leads to a rest.
-        noise: us between noise events.
+        noise: (R,) us between noise events.
 
     Raises:
         EvflowDataError: EV017 if the events cover no step.
     """
-    permitted = SILENT * noise
-    begin, end = int(events.t[0]) - permitted, int(events.t[-1]) + permitted
-    inside = [i for i, span in enumerate(spans) if span[1] >= begin and settled[i] <= end]
+    begin, end = int(events.t[0]) - SILENT * noise, int(events.t[-1]) + SILENT * noise
+    inside = [i for i, span in enumerate(spans) if span[1] >= begin[i] and settled[i] <= end[i]]
     if len(inside) < 2:
         raise EvflowDataError(
             "EV017", f"of {len(spans) - 1} steps of the light none lies between the first event, "
@@ -61,13 +65,16 @@ def covered(events: Events, spans: list[Span], settled: list[int], noise: float)
     return slice(inside[0], inside[-1] + 1)
 
 
-def watched(events: Events, span: Span, noise: float) -> Span:
+def watched(events: Events, span: Span, noise: float, *, fallen: bool = False) -> Span:
     """The longest part of a rest without a silence that its noise makes improbable; all of it where
-    several silences leave less than half, as between the bursts of a flickering light."""
+    several silences leave less than half, as between the bursts of a flickering light. fallen:
+    whether the light fell before it, after which leak begins late."""
     t = events.slice(*span).t
     bounds = np.concatenate([[span[0]], t, [span[1]]])
     pauses = np.diff(bounds)
     usual = float(np.quantile(pauses, 0.95)) if len(t) else 0.0
+    if fallen and len(t):
+        pauses[0] = 0
     silent = np.flatnonzero(pauses > max(SILENT * noise, UNUSUAL * usual))
     if not len(silent):
         return span

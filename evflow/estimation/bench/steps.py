@@ -19,6 +19,7 @@ from __future__ import annotations
 import numpy as np
 
 from evflow.camera import THETA_MIN
+from evflow.estimation.bench.leaking import NO_LEAK, Leaking
 from evflow.estimation.pixel_noise import ODD, pixel_rates
 from evflow.recordings.faulty_pixels import hot_at_rest
 
@@ -32,8 +33,9 @@ BIAS = 0.015  # relative error of the median threshold: 1.4 % low on eight simul
 
 
 def ratio(
-    levels: np.ndarray, n: np.ndarray, strays: np.ndarray, fresh: bool, noisy: np.ndarray,
-    lost: np.ndarray, lit: np.ndarray,
+    levels: np.ndarray, n: np.ndarray, strays: np.ndarray, fresh: bool, rests: np.ndarray,
+    lost: np.ndarray, lit: np.ndarray, leaking: Leaking = NO_LEAK,
+    seconds: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """theta = dlogI / events (2, H, W) over the steps of each direction, and the std of one event.
     Arguments as of `regression`."""
@@ -45,8 +47,9 @@ def ratio(
 
 
 def regression(
-    levels: np.ndarray, n: np.ndarray, strays: np.ndarray, fresh: bool, noisy: np.ndarray,
-    lost: np.ndarray, lit: np.ndarray,
+    levels: np.ndarray, n: np.ndarray, strays: np.ndarray, fresh: bool, rests: np.ndarray,
+    lost: np.ndarray, lit: np.ndarray, leaking: Leaking = NO_LEAK,
+    seconds: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Thresholds by iterated weighted least squares for (theta_ON, theta_OFF, r_0).
 
@@ -55,20 +58,28 @@ def regression(
         n: (K, 2, H, W) events of the steps, minus the noise.
         strays: (K, 2) expected noise events of each step.
         fresh: whether r_0 is 0.
-        noisy: (K+1, H, W) bool, rests with events.
+        rests: (K+1, 2, H, W) events at the rests.
         lost: (K, H, W) bool, steps whose events are not known.
         lit: (K+1, H, W) bool, rests whose level is known.
+        leaking: of the pixels.
+        seconds: (K+1,) of the rests, of leaking pixels.
 
     Returns:
         theta and its std, (2, H, W).
     """
+    noisy = rests.max(1) > 0
     theta, std = _regression(levels, n, strays, fresh, np.zeros_like(noisy), lost, lit)
     up = np.median(np.diff(levels, axis=0), (1, 2)) > 0
-    if storing(n, up, noisy, np.median(theta, (1, 2)), lost) > 0.5:
+    stores = storing(n, up, noisy, np.median(theta, (1, 2)), lost) > 0.5
+    if not stores and not leaking.hz:
+        return theta, std
+    n = n.copy()
+    if leaking.hz and seconds is not None:
+        n[:, 0] -= leaking.missing(seconds[:-1], rests[:-1], stores=stores)
+    if stores:
         # A noise event amid a step discards half a threshold of change on average.
-        missed = 0.5 * strays.sum(1)[:, None] * np.stack([up, ~up], 1)
-        return _regression(levels, n + missed[..., None, None], strays, fresh, noisy, lost, lit)
-    return theta, std
+        n += (0.5 * strays.sum(1)[:, None] * np.stack([up, ~up], 1))[..., None, None]
+    return _regression(levels, n, strays, fresh, noisy & stores, lost, lit)
 
 
 def storing(
@@ -200,41 +211,42 @@ def camera_wide(
 
 
 def camera_rate(
-    counts: np.ndarray, seconds: float, dead: np.ndarray
+    counts: np.ndarray, seconds: np.ndarray, dead: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean rates (2,) in Hz of counts (2, H, W) without hot and dead pixels, and (H, W) bool, those
-    that are not hot."""
+    """Mean rates (2,) in Hz of counts (2, H, W) in seconds (2,), without hot and dead pixels, and
+    (H, W) bool, those that are not hot."""
     kept = ~hot_at_rest(counts.sum(0))
     used = kept & ~dead
-    return counts[:, used].mean(1) / seconds if seconds > 0 else np.zeros(2), kept
+    return counts[:, used].mean(1) / seconds if seconds.min() > 0 else np.zeros(2), kept
 
 
 def pixel_and_camera_rates(
-    counts: np.ndarray, seconds: float, dead: np.ndarray
+    counts: np.ndarray, seconds: np.ndarray, dead: np.ndarray, unsure_hz: float = 0.0
 ) -> tuple[np.ndarray, tuple[np.ndarray, list[tuple[float, float]]]]:
     """Noise rates by `pixel_rates`, a hot pixel's its own count, a dead one's the camera's.
 
     Args:
         counts: (2, H, W) events at rest.
-        seconds: counting time.
+        seconds: (2,) counting time of either polarity.
         dead: (H, W) bool.
+        unsure_hz: error of the ON rate beside that of the counts.
 
     Returns:
         Rates (2, H, W) in Hz; their std, and per polarity the mean rate over pixels that are
         neither hot nor dead and its std.
     """
     hz, kept = camera_rate(counts, seconds, dead)
-    if seconds <= 0:
+    if seconds.min() <= 0:
         flat = np.zeros(counts.shape)
         return flat, (flat, [(0.0, 0.0)] * 2)
     used = kept & ~dead
     mean = np.maximum(hz, 1e-12)
-    variance = np.array([c[used].var() / seconds**2 for c in counts])
+    variance = np.array([c[used].var() for c in counts]) / seconds**2
     variance = np.maximum(variance - mean / seconds, 1e-4 * mean**2)
     pixels = max(int(used.sum()), 1)
-    error = np.sqrt((mean / seconds + variance) / pixels + 1.0 / (seconds * pixels) ** 2)
-    watched = np.where(dead, 0.0, seconds)
+    error = np.sqrt((mean / seconds + variance) / pixels + 1.0 / (seconds * pixels) ** 2
+                    + np.array([unsure_hz, 0.0]) ** 2)
     eta, std = np.stack([
-        pixel_rates(c, watched, m, ~kept, error=e / m, odd=ODD)
-        for c, m, e in zip(counts, mean.tolist(), error.tolist(), strict=True)], 1)
+        pixel_rates(c, np.where(dead, 0.0, s), m, ~kept, error=e / m, odd=ODD)
+        for c, s, m, e in zip(*map(list, (counts, seconds, mean, error)), strict=True)], 1)
     return eta, (std, [(float(m), float(e)) for m, e in zip(hz, error, strict=True)])

@@ -100,7 +100,7 @@ def test_silence_between_the_bursts_of_a_flicker_is_observed() -> None:
     events = Events(RNG.integers(0, width, t.size), RNG.integers(0, height, t.size), t,
                     RNG.random(t.size) < 0.5, (width, height))
     rests = [(0, 500_000), (500_000, 1_000_000)]
-    assert watched(events, rests[1], noise_us(events, rests)) == rests[1]
+    assert watched(events, rests[1], noise_us(events, rests, np.array([True]))[1]) == rests[1]
 
 
 def test_lost_steps_are_those_far_below_the_others() -> None:
