@@ -215,3 +215,12 @@ def test_the_less_probable_law_widens_what_is_left_open() -> None:
         3e-3, np.array([0.2, 0.3]), np.diag([4.0, 1e-8, 1e-8]), np.array([0.1, 0.0]))
     assert covariance == pytest.approx(np.diag([4.0, 1e-8 + 0.25 * 4e-6, 1e-8]))
     assert theta_error == pytest.approx([0.1, 0.5 * np.log(2)])
+
+
+@pytest.mark.parametrize("by_light", [False, True])
+def test_what_an_even_low_pass_and_a_delay_trade_is_in_their_errors(by_light: bool) -> None:
+    found = find(looked_at(0.0, 30.0, 0.0, by_light))
+    assert found.seen.by_light == by_light
+    traded = found.covariance[1, 2] / np.sqrt(found.covariance[1, 1] * found.covariance[2, 2])
+    assert (traded < -0.5) == (not by_light)
+    assert (found.std[1] > 3.9e-4) == (not by_light)
