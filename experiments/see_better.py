@@ -8,13 +8,13 @@ The same network is trained for each condition (shared/conditions.py): default p
 randomisation (thresholds uniform on .1 to 1, and log-uniform on .05 to 1), evflow's estimate of the
 target camera from a 2 s recording of it, and the target's true maps (oracle); in `full` also what
 the compared systems estimate and, for video, the thresholds of the original E2VID (e2vid), for flow
-the target's own recordings (raw). evflow+circuit and oracle+circuit train with the target's circuit
-and the light that its frames lack; all others with one that no target has (shared/targets.py).
-Seeds are paired: scenes, initial parameters and batches are the same for all conditions of a seed
-but raw. Images are scored in the later windows of held-out scenes, clipped to [0, 1]: SSIM (preset
-evreal), MSE, PSNR, LPIPS where its weights are installed, and MSE of log(1 + 255 I) / log 256; flow
-by its error at pixels with events, and FWL beside that of the true flow. --recordings NAME=PATH:
-real recordings, measured, and scored by their frames, or by FWL.
+the target's own recordings (raw). evflow ideal takes pixels for ideal, as the compared systems do.
+evflow+circuit and oracle+circuit train with the target's circuit and the light that its frames
+lack; all others with one that no target has (shared/targets.py). Seeds are paired: scenes, initial
+parameters and batches are the same for all conditions of a seed but raw. Images are scored in the
+later windows of held-out scenes, clipped to [0, 1]: SSIM (preset evreal), MSE, PSNR, LPIPS where
+installed, and MSE of log(1 + 255 I) / log 256; flow by its error at pixels with events, and FWL
+beside that of the true flow. --recordings NAME=PATH: real ones, scored by their frames, or by FWL.
 
 A finished training stays in --out with its scores: the same command goes on with what is missing,
 and one that asks for more adds to it. One that asks for less than the tables there is refused.

@@ -47,8 +47,10 @@ DEFAULT, WIDE, WIDE_LOG, E2V = "default", "wide", "wide-log", "e2vid"
 OURS, ORACLE, RAW = "evflow", "oracle", "raw"
 CIRCUIT = "+circuit"
 OURS_WHOLE, ORACLE_WHOLE = OURS + CIRCUIT, ORACLE + CIRCUIT
+OURS_IDEAL = "evflow ideal"  # pixels taken for ideal, as compared systems take them
 OF_KNOWN = (ORACLE, ORACLE_WHOLE, RAW)
-CHOICES = (DEFAULT, WIDE, WIDE_LOG, E2V, OURS, OURS_WHOLE, *OF_KNOWN, *SYSTEMS)
+CHOICES = (DEFAULT, WIDE, WIDE_LOG, E2V, OURS, OURS_WHOLE, OURS_IDEAL,
+           *OF_KNOWN, *SYSTEMS)
 # Thresholds uniform in .1 to 1, or log-uniform in .05 to 1 (the prior for unknown cameras).
 PRIORS = {WIDE: WidePrior(theta=(0.1, 1.0), uniform=True), WIDE_LOG: WidePrior()}
 DEFAULT_THETA, DEFAULT_MISMATCH = 0.2, 0.03
@@ -153,6 +155,12 @@ class Workshop:
         """`estimate_camera` of the target's recording."""
         return self.stored(self._estimate(target))
 
+    def ideal(self, target: AnyTarget) -> Camera:
+        """The same of pixels that are taken for ideal."""
+        return self.stored(self.kept(
+            target, OURS_IDEAL, lambda r: estimate_camera(r, self.params, pixel="ideal"),
+            target.source))
+
     def circuit(self, target: AnyTarget) -> Circuit:
         """That of `estimated`."""
         return read_sensor(self._estimate(target))
@@ -246,7 +254,7 @@ def _named(shop: Workshop, targets: Sequence[AnyTarget], name: str) -> list[Cond
     if name in OF_KNOWN:
         return _of_known(shop, [t for t in targets if isinstance(t, Target)], name)
     own: dict[str, Callable[[AnyTarget], Camera]] = {
-        OURS: shop.estimated, OURS_WHOLE: shop.estimated,
+        OURS: shop.estimated, OURS_WHOLE: shop.estimated, OURS_IDEAL: shop.ideal,
         **{system: lambda t: shop.compared(t, name) for system in SYSTEMS}}
     if name not in own:
         raise EvflowDataError("EV020", f"condition {name!r}.", f"Choose of {list(CHOICES)}.")

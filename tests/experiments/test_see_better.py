@@ -26,6 +26,7 @@ from evflow.scenes import make_bank
 from evflow.types import Events
 from experiments import see_better
 from experiments.see_better import Options
+from experiments.shared import conditions as made_for
 from experiments.shared import eventgan_sequences, gains, held_out, same_runs, targets
 from experiments.shared.common import slug
 from experiments.shared.conditions import (
@@ -195,6 +196,22 @@ def test_a_condition_has_the_targets_circuit_where_it_says_so(tmp_path: Path) ->
         "high noisy evflow+circuit": (measured, 5.0), "high esim evflow+circuit": (measured, 5.0),
         "high noisy oracle+circuit": (slow.circuit, 0.0), "mine": (measured, 5.0),
         "high esim oracle+circuit": (fast.circuit, 0.0)}
+
+
+def test_taken_for_ideal_a_camera_is_measured_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def measured(_recording: object, _params: object, *, pixel: str = "") -> Camera:
+        return Camera.constant(SHAPE, theta_on=0.4 if pixel == "ideal" else 0.2)
+
+    monkeypatch.setattr(made_for, "estimate_camera", measured)
+    shop = dataclasses.replace(workshop(tmp_path), record=lambda _: recordings.make())
+    for name, theta in (("evflow", 0.2), ("evflow ideal", 0.4), ("evflow", 0.2)):
+        condition, = conditions(shop, [target()], (name,))
+        camera = condition.make()
+        assert camera is not None
+        np.testing.assert_allclose(camera.theta_on, theta)
+        assert condition.circuit is None
 
 
 def test_cameras_larger_than_a_target_are_cropped_alike_with_their_errors(tmp_path: Path) -> None:
