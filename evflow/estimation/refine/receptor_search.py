@@ -35,10 +35,6 @@ from evflow.estimation.refine.receptor_result import Found
 from evflow.simulator.photoreceptor import FAST, TYPICAL, Photoreceptor
 
 FLOOR = np.array([0.5, 1e-4, 5e-4])  # std of offset, tau and delay
-# A low-pass that is the same in any light and a delay act alike on slow changes. A path between
-# frames is smoother than the light, and tau came out .2 to .65 ms short on 15 of 18 cameras of 40
-# Hz, the delay as much longer.
-TRADED = 4e-4  # s
 # Log odds required, beside the evidence of net changes, for an offset in the frames of an ideal
 # pixel:
 ALONE = 2.0
@@ -130,8 +126,6 @@ def _errors(phi: np.ndarray, model: Regression, size: float) -> tuple[np.ndarray
     derivatives at phi, or along the offset from the likelihood if that is wider."""
     slopes = model.slopes(phi)
     near = _covariance(slopes, model.curvature(phi), model.prior)
-    if not model.by_light:
-        near += TRADED**2 * np.outer([0.0, 1.0, -1.0], [0.0, 1.0, -1.0])
     lead = near[:, 0] / near[0, 0]
 
     def step(at: np.ndarray) -> np.ndarray:

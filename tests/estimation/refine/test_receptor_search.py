@@ -3,6 +3,7 @@ found again in events that an independent pixel makes of a known film."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -24,6 +25,7 @@ from evflow.estimation.refine.receptor_data import Sample, sample
 from evflow.estimation.refine.receptor_prior import FEW, FEWER, small_sample_odds
 from evflow.estimation.refine.receptor_profile import Other
 from evflow.estimation.refine.receptor_regression import Regression
+from evflow.estimation.refine.receptor_result import TRADED
 from evflow.estimation.refine.receptor_search import find
 from evflow.estimation.refine.sightings import sight
 from evflow.simulator.photoreceptor import FAST, IDEAL, Photoreceptor, seen_path
@@ -221,6 +223,18 @@ def test_the_less_probable_law_widens_what_is_left_open() -> None:
 def test_what_an_even_low_pass_and_a_delay_trade_is_in_their_errors(by_light: bool) -> None:
     found = find(looked_at(0.0, 30.0, 0.0, by_light))
     assert found.seen.by_light == by_light
-    traded = found.covariance[1, 2] / np.sqrt(found.covariance[1, 1] * found.covariance[2, 2])
-    assert (traded < -0.5) == (not by_light)
-    assert (found.std[1] > 3.9e-4) == (not by_light)
+    own = np.sqrt(np.diag(found.covariance))
+    assert found.std[0] == own[0]
+    np.testing.assert_allclose(found.std[1:], np.hypot(own[1:], 0.0 if by_light else TRADED))
+    assert found.sensor[1]["cutoff_hz"] == pytest.approx(
+        found.seen.cutoff_hz * found.std[1] / found.seen.tau_s)
+
+
+def test_a_low_pass_that_the_events_show_is_kept_however_it_trades_with_a_delay() -> None:
+    found = find(looked_at(0.0, 30.0, 0.0, False))
+    short = dataclasses.replace(
+        found, seen=dataclasses.replace(found.seen, tau_s=1.5 * TRADED),
+        covariance=np.diag([1.0, (0.5 * TRADED) ** 2, 1e-8]))
+    assert short.sensor[0].cutoff_hz > 0.0
+    assert dataclasses.replace(
+        short, covariance=np.diag([1.0, TRADED**2, 1e-8])).sensor[0].cutoff_hz == 0.0
