@@ -23,7 +23,7 @@ from evflow.estimation.one_polarity import (
     with_prior,
     without_those,
 )
-from evflow.estimation.pixel_noise import beyond_neighbours
+from evflow.estimation.pixel_noise import hot_rates
 from evflow.estimation.pooled import Quiet, need_shown, quiet_times
 from evflow.estimation.refine import Chunk
 from evflow.estimation.remarks import (
@@ -126,7 +126,6 @@ def estimate(
         quiet.light, leak.rate_hz, scatter(quiet.maps, refined.faulty), SIGNAL_ERROR)
     sent = quiet.at_mean_light() if shot.falls else quiet.maps.copy()
     sent[:, 1, dead] = 0.0  # seconds in which noise could be seen
-    sent = beyond_neighbours(sent, state.sent, state.seconds, hot)
     if shot.falls:
         summary, std = _at_mean_light(summary, std, quiet, leak)
     if state.evidence is not None:
@@ -135,6 +134,9 @@ def estimate(
         again = _counted(windows_of(state.read), advance)
         camera, error = maps.by_flow(state.params, again, summary, std)
     camera, error, summary, std = maps.with_rates(camera, error, sent, hot, summary, std)
+    if hot.any():
+        camera, error = maps.with_hot_rates(
+            camera, error, hot, *hot_rates(sent, state.sent, state.seconds, hot))
     as_sent = summary
     if lost := front_end.lost:
         camera, error, summary, std = maps.with_contrast_lost(

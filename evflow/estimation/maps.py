@@ -101,6 +101,18 @@ def with_rates(
             dataclasses.replace(summary, **means), dataclasses.replace(summary_std, **mean_errors))
 
 
+def with_hot_rates(
+    camera: Camera, std: Camera, hot: np.ndarray, rates: np.ndarray, errors: np.ndarray
+) -> tuple[Camera, Camera]:
+    """The maps with these noise rates (2, N) of the hot (H, W) pixels, and their std."""
+    def put(of: Camera, values: np.ndarray) -> Camera:
+        return dataclasses.replace(of, **{
+            name: getattr(of, name).at[hot].set(v.astype(np.float32))
+            for name, v in zip(("eta_on", "eta_off"), values, strict=True)})
+
+    return put(camera, rates), put(std, errors)
+
+
 def with_unquiet_error(
     summary: Summary, std: Summary, share: np.ndarray, pixel_s: float
 ) -> Summary:

@@ -35,7 +35,6 @@ SHARES = np.linspace(SIGNAL, 1.0, 6)  # of the noise, that follows the threshold
 UNEVEN_ERROR, COUNTS_ERROR = 0.3, 0.15
 PLAIN_THETA, PLAIN_ODDS = 0.1, 1.0  # log units: twice STILL; log odds among pixels above it only
 
-SELDOM = 0.1  # share of the recording: less quiet time does not tell a hot pixel's rate
 BESIDE = 5  # pixels: side of the neighbourhood that sees what a hot pixel does
 AROUND = 9  # pixels: side of the neighbourhood in which other events are counted
 CHANCE = 4.0  # standard deviations of noise allowed around a pixel
@@ -136,21 +135,26 @@ def pixel_rates(
     return rate, std
 
 
-def beyond_neighbours(quiet: Array, sent: Array, seconds: float, hot: Array) -> Array:
-    """quiet (2, 2, H, W) of `quiet_time` with more of hot (H, W) pixels that were seldom quiet, as
-    where the whole scene moves: what they sent beyond the median of their neighbours. Given as the
-    events and seconds of a Poisson count of that rate and its error, which includes the spread of
-    the neighbours. sent (2, H, W): ON and OFF events in all the `seconds`."""
-    found = quiet.copy()
-    for (events, watched), own in zip(found, sent.astype(np.float32), strict=True):
-        seldom = hot & (watched < SELDOM * seconds)
+def hot_rates(
+    quiet: Array, sent: Array, seconds: float, hot: Array
+) -> tuple[Array, Array]:
+    """Noise rates (2, N) in Hz of the hot (H, W) pixels, and their std.
+
+    What they send while nothing happens near them, quiet (2, 2, H, W) of `quiet_time`, and, as
+    where the whole scene moves nothing ever rests, what they send beyond the median of their
+    neighbours in all the `seconds`, sent (2, H, W) ON and OFF, with the neighbours' spread: both
+    weighted by their precision."""
+    rates, stds = [], []
+    for (events, watched), own in zip(quiet, sent.astype(np.float32), strict=True):
         usual = cv2.medianBlur(np.where(hot, 0.0, own).astype(np.float32), BESIDE)
-        excess = np.maximum(own - usual, 0.0)[seldom]
-        spread = cv2.medianBlur(np.abs(own - usual), BESIDE)[seldom]
-        variance = own[seldom] + 1.0 + (1.5 * spread) ** 2
-        events[seldom] = excess**2 / variance
-        watched[seldom] = excess / variance * seconds
-    return found
+        spread = cv2.medianBlur(np.abs(own - usual), BESIDE)[hot]
+        beyond = np.maximum(own - usual, 0.0)[hot] / seconds
+        beyond_std = np.sqrt(own[hot] + 1.0 + (1.5 * spread) ** 2) / seconds
+        n, alone = events[hot].astype(np.float64), np.maximum(watched[hot], 1e-9)
+        weight = np.stack([alone**2 / (n + 1.0), beyond_std**-2.0])
+        rates.append((weight * [n / alone, beyond]).sum(0) / weight.sum(0))
+        stds.append(weight.sum(0) ** -0.5)
+    return np.stack(rates), np.stack(stds)
 
 
 def _mean_rate(n: Array, seconds: Array, used: Array) -> float:

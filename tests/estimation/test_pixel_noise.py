@@ -12,7 +12,7 @@ from evflow.estimation.maps import with_rates, with_unquiet_error
 from evflow.estimation.pixel_noise import (
     ODD,
     _shapes,
-    beyond_neighbours,
+    hot_rates,
     pixel_rates,
     quiet_time,
     threshold_law,
@@ -251,20 +251,29 @@ def test_rates_are_less_certain_where_little_is_quiet_and_noise_events_are_many(
 
 def test_hot_pixels_before_moving_scenes_have_what_they_send_beyond_their_neighbours() -> None:
     rng = np.random.default_rng(0)
-    seconds, shape = 2.0, (30, 40)
+    seconds, shape = 2.0, (60, 80)
     sent = rng.poisson(14.0, (2, *shape)).astype(np.float64)
     hot = np.zeros(shape, bool)
     hot[4::8, 4::8] = True
     sent[0, hot] += rng.poisson(24.0 * seconds, hot.sum())
+    rate, std = hot_rates(np.zeros((2, 2, *shape), np.float32), sent, seconds, hot)
+    away = (rate - [[24.0], [0.0]]) / std
+    assert abs(away[0].mean()) < 0.3
+    assert 0.8 < away[0].std() < 1.2
+    assert (away[1] < 4.0).all()
+    assert (std < 8.0).all()
+
+
+def test_what_hot_pixels_send_at_rest_counts_by_its_precision() -> None:
+    """One of 24 Hz ON, no OFF, that was often quiet, before neighbours that send 600 events."""
+    shape, hot = (20, 20), np.zeros((20, 20), bool)
+    hot[10, 10] = True
+    sent = np.random.default_rng(1).poisson(600.0, (2, *shape)).astype(np.float64)
+    sent[:, 10, 10] = 600 + 60 * 24, 601
     quiet = np.zeros((2, 2, *shape), np.float32)
-    quiet[:, :, 4, 4] = [[9.0, 0.5]] * 2  # often alone: its own
-    found = beyond_neighbours(quiet, sent, seconds, hot)
-    assert (found[:, :, ~hot] == 0.0).all()
-    np.testing.assert_array_equal(found[:, :, 4, 4], quiet[:, :, 4, 4])
-    hot[4, 4] = False
-    rate, std = pixel_rates(*found[0], 0.1, hot, error=0.1)
-    away = (rate[hot] - 24.0) / std[hot]
-    assert abs(away.mean()) < 0.5
-    assert 0.6 < away.std() < 1.4
-    off, off_std = pixel_rates(*found[1], 0.1, hot, error=0.1)
-    assert (off[hot] < 0.1 + 2.5 * np.maximum(off_std[hot], 1.5)).all()
+    quiet[:, :, 10, 10] = [[480.0, 20.0], [0.0, 20.0]]
+    (on, off), (on_std, off_std) = (v[:, 0] for v in hot_rates(quiet, sent, 60.0, hot))
+    assert on == pytest.approx(24.0, abs=2 * on_std)
+    assert on_std < 1.0
+    assert off < 0.1
+    assert 0.02 < off_std < 0.06

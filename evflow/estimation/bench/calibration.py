@@ -19,12 +19,13 @@ from evflow.camera.sensors import LogMap
 from evflow.errors import EvflowDataError
 from evflow.estimation.bench.counting import Span, Steps, counted_steps
 from evflow.estimation.bench.coverage import lost_steps, skipped_notes
-from evflow.estimation.bench.fast_edges import with_fast_edges
+from evflow.estimation.bench.fast_edges import by_rested, with_fast_edges
 from evflow.estimation.bench.latency import measured_latency
-from evflow.estimation.bench.leaking import measured_leaking
+from evflow.estimation.bench.leaking import NO_LEAK, measured_leaking
 from evflow.estimation.bench.levels import few_sizes, measured_bench
 from evflow.estimation.bench.logarithm import chosen_map
 from evflow.estimation.bench.rests import LEAST_STEP, rests_between
+from evflow.estimation.bench.settling import slow
 from evflow.estimation.bench.steps import (
     camera_rate,
     camera_wide,
@@ -86,7 +87,8 @@ def calibrate_step(
     dead = dead_pixels(n_events)
     up, rests_s = steps.changes > 0, steps.rests_s
     kept = camera_rate(rest, np.full(2, steps.rest_s), dead)[1]
-    leaking = measured_leaking(recording.events, steps.quiet, up, kept & ~dead)
+    leaking = NO_LEAK if slow(steps.notes) else measured_leaking(
+        recording.events, steps.quiet, up, kept & ~dead)
     watched_s = np.array([leaking.watched(rests_s, up), steps.rest_s])
     hz = camera_rate(rest, watched_s, dead)[0]
     strays = steps.seconds[:, None] * hz
@@ -95,8 +97,10 @@ def calibrate_step(
     steps, log_map = _with_right_map(steps, clean[:, :, kept].mean(-1))
     missed = lost_steps(steps.changes, clean[:, :, kept].mean(-1), sized)
     lost = np.broadcast_to(missed[:, None, None], (len(missed), *kept.shape))
-    theta, error = (ratio if literal else regression)(
-        steps.levels, clean, strays, fresh, steps.rests, lost, steps.lit, leaking, rests_s)
+    given = steps.levels, clean, strays, fresh, steps.rests, lost, steps.lit
+    theta, error = ratio(*given) if literal else regression(
+        *given, (leaking, rests_s, steps.since) if leaking.hz else None)
+    by_leak = np.array([leaking.theta_error(steps.since[:-1], clean[:, 0]), 0.0])
     events = np.where(lost[:, None], 0.0, steps.counts).sum(0)
     enough = (events >= FEW_EVENTS) & (events > 2 * strays.sum(0)[:, None, None])
     enough &= steps.reach > LEAST_STEP
@@ -110,10 +114,11 @@ def calibrate_step(
         if good.any() and good.sum() < MOST * kept.sum():
             # Those with enough events are the ones that happen to send more.
             own = float(np.hypot(own, np.median(error[i][good])))
-        medians.append((median, own))
+        medians.append((median, float(np.hypot(own, by_leak[i] * median))))
         spreads.append((spread, spread_error))
         maps.append(np.where(sound[i], theta[i], median))
-        stds.append(np.where(sound[i], error[i], np.hypot(spread, own)))
+        stds.append(np.hypot(np.where(sound[i], error[i], np.hypot(spread, own)),
+                             by_leak[i] * maps[i]))
     eta, eta_std = pixel_and_camera_rates(
         rest, watched_s, dead, leaking.std_hz if leaking.hz else 0.0)
     valid = (sound | ~enough.any((1, 2))[:, None, None]).all(0) & enough.any(0) & kept
@@ -121,12 +126,13 @@ def calibrate_step(
                       n_events, ~kept, int((~missed).sum()),
                       _notes(steps, undetermined, valid, ~kept, dead, missed),
                       tuple(undetermined))
-    found = with_fast_edges(
-        found, steps.changes, clean[:, :, kept].mean(-1), sized & ~missed)
+    if not leaking.hz and not literal:
+        found = with_fast_edges(
+            found, steps.changes, by_rested(clean, steps.rests, kept & ~dead), sized & ~missed)
     shown = measured_bench(
         steps.unit, recording.events, steps.spans, steps.settled, steps.quiet, steps.light,
         np.median(steps.levels, (1, 2)), steps.rests, clean, kept, np.where(sound, theta, np.nan),
-        sized & ~missed, not any(note.code == "steps.slow" for note in steps.notes))
+        sized & ~missed, not slow(steps.notes))
     if triggers_us is not None:
         shown = dataclasses.replace(shown, latency=measured_latency(
             recording.events, triggers_us, steps.spans, steps.settled,

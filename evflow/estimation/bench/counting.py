@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.errors import EvflowDataError
-from evflow.estimation.bench.coverage import covered, noise_us, watched
+from evflow.estimation.bench.coverage import SILENT, covered, noise_us, watched
 from evflow.estimation.bench.levels import Unit, light_of_rests, lux_notes
 from evflow.estimation.bench.logarithm import Other, other_map
 from evflow.estimation.bench.rests import check_steps, find_rests
@@ -37,7 +37,8 @@ class Steps:
 
     levels: (K+1, H, W) log intensity at each rest; lit: (K+1, H, W) bool, where it is known, as the
     frames are neither saturated nor black; counts: (K, 2, H, W) ON and OFF events of each
-    step; seconds: (K,) counting time of each; rests: (K+1, 2, H, W) events at each rest; spans: the
+    step; seconds: (K,) counting time of each; rests: (K+1, 2, H, W) events at each rest; since:
+    (K+1, H, W) seconds from the last of these, or from the begin, to the rest's end; spans: the
     rests; settled: times until which events belong to the step that leads to a rest; quiet: the
     parts of the rests in which events were counted as noise; light: (K+1,) in unit;
     uncovered, silent_s: steps beyond the events, and time at rest whose events are missing, both
@@ -49,6 +50,7 @@ class Steps:
     counts: np.ndarray
     seconds: np.ndarray
     rests: np.ndarray
+    since: np.ndarray
     spans: list[Span]
     settled: list[int]
     quiet: list[Span]
@@ -117,7 +119,7 @@ def counted_steps(
     settled = settled_at(spans, SETTLE_US)
     up = np.diff(np.median(levels, (1, 2))) > 0
     noise = noise_us(events, [(a, b) for a, (_, b) in zip(settled, spans, strict=True)], up)
-    inside = covered(events, spans, settled, noise)
+    inside = covered(events, spans, settled, float(noise.min()))
     uncovered = len(spans) - len(spans[inside])
     levels, lit, spans, noise = levels[inside], lit[inside], spans[inside], noise[inside]
     settle, slow = settling_us(events, spans)
@@ -129,17 +131,32 @@ def counted_steps(
     seconds = [(after - before[1]) * 1e-6
                for before, after in zip(spans, settled[1:], strict=False)]
     rested = [(a, b) for a, (_, b) in zip(settled, spans, strict=True)]
-    fallen = [False, *(np.diff(np.median(levels, (1, 2))) < 0)]
-    quiet = [watched(events, span, every, fallen=bool(fell))
-             for span, every, fell in zip(rested, noise, fallen, strict=True)]
+    fallen = np.concatenate([[False], np.diff(np.median(levels, (1, 2))) < 0])
+    late = fallen * SILENT * _between_off(events, rested)
+    quiet = [watched(events, *of_rest) for of_rest in zip(rested, noise, late, strict=True)]
     silent = sum(b - a for a, b in rested) - sum(b - a for a, b in quiet)
     rests = np.stack([events.slice(a, b).count_map() for a, b in quiet])
+    since = np.stack([_since_last(events.slice(a, b), a, b) for a, b in quiet])
     busiest = max((events.slice(a, b) for a, b in quiet), key=len)
     shown = (np.asarray(light, np.float64) if light is not None else
              np.asarray(lin_log_inverse(jnp.asarray(np.median(levels, (1, 2)))), np.float64))
-    return Steps(levels, lit, np.array(counts, np.float64), np.array(seconds), rests, spans,
+    return Steps(levels, lit, np.array(counts, np.float64), np.array(seconds), rests, since, spans,
                  settled, quiet, shown, unit, uncovered, silent * 1e-6, other,
                  (*_restless(busiest), *doubts, *slow, *_clipped(lit)))
+
+
+def _since_last(events: Events, begin: int, end: int) -> np.ndarray:
+    """(H, W) seconds from each pixel's last event, or the begin, to the end (us)."""
+    width, height = events.size
+    since = np.full((height, width), (end - begin) * 1e-6)
+    since[events.y, events.x] = (end - events.t) * 1e-6  # in order of time: the last one stays
+    return since
+
+
+def _between_off(events: Events, rested: list[Span]) -> float:
+    """Mean time in us between OFF events at the rests, of all pixels: noise that is no leak."""
+    sent = sum(int((~events.slice(*span).p).sum()) for span in rested)
+    return sum(b - a for a, b in rested) / max(sent, 1)
 
 
 def _rests(recording: Recording, rests_us: Sequence[Span] | None) -> list[Span]:

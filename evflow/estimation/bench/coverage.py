@@ -40,22 +40,21 @@ def noise_us(events: Events, quiet: list[Span], up: np.ndarray) -> np.ndarray:
     return np.divide(1.0, found, out=np.full(len(found), np.inf), where=found > 0)
 
 
-def covered(
-    events: Events, spans: list[Span], settled: list[int], noise: np.ndarray
-) -> slice:
+def covered(events: Events, spans: list[Span], settled: list[int], noise: float) -> slice:
     """Those of the rests between which the events are complete.
 
     Args:
         events: of the recording.
         spans: the R rests.
         settled: (R,) times until which events belong to the step that leads to a rest.
-        noise: (R,) us between noise events.
+        noise: us between noise events.
 
     Raises:
         EvflowDataError: EV017 if the events cover no step.
     """
-    begin, end = int(events.t[0]) - SILENT * noise, int(events.t[-1]) + SILENT * noise
-    inside = [i for i, span in enumerate(spans) if span[1] >= begin[i] and settled[i] <= end[i]]
+    permitted = SILENT * noise
+    begin, end = int(events.t[0]) - permitted, int(events.t[-1]) + permitted
+    inside = [i for i, span in enumerate(spans) if span[1] >= begin and settled[i] <= end]
     if len(inside) < 2:
         raise EvflowDataError(
             "EV017", f"of {len(spans) - 1} steps of the light none lies between the first event, "
@@ -65,15 +64,15 @@ def covered(
     return slice(inside[0], inside[-1] + 1)
 
 
-def watched(events: Events, span: Span, noise: float, *, fallen: bool = False) -> Span:
+def watched(events: Events, span: Span, noise: float, late_us: float = 0.0) -> Span:
     """The longest part of a rest without a silence that its noise makes improbable; all of it where
-    several silences leave less than half, as between the bursts of a flickering light. fallen:
-    whether the light fell before it, after which leak begins late."""
+    several silences leave less than half, as between the bursts of a flickering light. late_us: how
+    long it may be silent at first, as leak begins late after the light fell."""
     t = events.slice(*span).t
     bounds = np.concatenate([[span[0]], t, [span[1]]])
     pauses = np.diff(bounds)
     usual = float(np.quantile(pauses, 0.95)) if len(t) else 0.0
-    if fallen and len(t):
+    if len(t) and pauses[0] < late_us:
         pauses[0] = 0
     silent = np.flatnonzero(pauses > max(SILENT * noise, UNUSUAL * usual))
     if not len(silent):

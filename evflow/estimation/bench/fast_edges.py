@@ -25,27 +25,29 @@ LEAST = 0.03  # relative change of theta that matters
 LEVEL_ERROR = 0.01  # log units, of a step's size
 PASSES = 3
 PARTS = 3  # unknowns: two thresholds and d / T
+FREE = 3  # steps beyond the unknowns
+RESTED = 0.2  # share of the pixels that must be without noise at a rest
 
 
 def kept_by_small_steps(
     changes: np.ndarray, sent: np.ndarray, theta: np.ndarray, known: np.ndarray
-) -> np.ndarray | None:
-    """Thresholds (2,) of vanishing steps, on which no contrast is lost; None where those of all
-    sizes agree.
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Thresholds (2,) of vanishing steps, on which no contrast is lost, and their std; None where
+    those of all sizes agree.
 
     Args:
         changes: (K,) log units.
-        sent: (K, 2) ON and OFF events per pixel minus the noise.
+        sent: (K, 2) ON and OFF events per pixel minus the noise, NaN where unknown.
         theta: (2,) thresholds by all steps.
         known: (K,) bool, steps whose size and events are known.
     """
     up = changes > 0
     n = np.where(up, sent[:, 0], sent[:, 1])
     turned = np.diff(up, prepend=up[0])
-    used = known & (n > 1.0)
+    used = known & (np.nan_to_num(n) > 1.0)
     used[0] = False  # what came before the first is not known
     design = np.stack([n * up, n * ~up, n * np.abs(changes)], 1)[used]
-    if used.sum() <= PARTS or np.linalg.matrix_rank(design) < PARTS:
+    if used.sum() < PARTS + FREE or np.linalg.matrix_rank(design) < PARTS:
         return None
     found = np.array([*theta, 0.0])
     for _ in range(PASSES):
@@ -54,11 +56,21 @@ def kept_by_small_steps(
         found = np.linalg.lstsq(design, way, rcond=None)[0]
     rest = way - design @ found
     error = max(float(np.sqrt(rest @ rest / (used.sum() - PARTS))), LEVEL_ERROR)
-    std = error * np.sqrt(np.linalg.inv(design.T @ design)[2, 2])
+    std = error * np.sqrt(np.diag(np.linalg.inv(design.T @ design)))
     lost = found[2] * np.median(np.abs(changes[used]))
-    if found[2] < SURE * std or lost < LEAST * theta.mean():
+    if found[2] < SURE * std[2] or lost < LEAST * theta.mean() or (found[:2] > theta).any():
         return None
-    return np.maximum(found[:2], 0.0)
+    return np.maximum(found[:2], 0.0), std[:2]
+
+
+def by_rested(clean: np.ndarray, rests: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """(K, 2) mean events of the steps over pixels without noise at the rest before, which may have
+    reset their memory; NaN where fewer than RESTED are. clean: (K, 2, H, W) events minus the noise;
+    rests: (K + 1, 2, H, W) events at rest; used: (H, W) bool."""
+    rested = (rests[:-1].sum(1) == 0) & used
+    share = rested.sum((1, 2)) / max(int(used.sum()), 1)
+    mean = (clean * rested[:, None]).sum((2, 3)) / np.maximum(rested.sum((1, 2)), 1)[:, None]
+    return np.where((share >= RESTED)[:, None], mean, np.nan)
 
 
 def with_fast_edges(
@@ -69,12 +81,13 @@ def with_fast_edges(
     1 to 4 % from the truth where those by all steps were 3 to 9 % above it (pixels held in reset).
     Arguments as of `kept_by_small_steps`."""
     theta = np.array([float(getattr(found.summary, name)) for name in THRESHOLDS])
-    small = None if found.undetermined else kept_by_small_steps(changes, sent, theta, known)
-    if small is None:
+    kept = None if found.undetermined else kept_by_small_steps(changes, sent, theta, known)
+    if kept is None:
         return found
+    small = kept[0]
     camera, std, summary, summary_std = found.camera, found.std, found.summary, found.summary_std
-    for name, value, other in zip(THRESHOLDS, theta, small, strict=True):
-        mean, away = 0.5 * (value + other), 0.5 * abs(value - other)
+    for name, value, other, error in zip(THRESHOLDS, theta, *kept, strict=True):
+        mean, away = 0.5 * (value + other), 0.5 * np.hypot(value - other, error)
         by, maps = jnp.float32(mean / value), getattr(camera, name)
         std = dataclasses.replace(std, **{
             name: jnp.hypot(getattr(std, name) * by, maps * jnp.float32(away / value))})

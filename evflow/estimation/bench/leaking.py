@@ -3,7 +3,7 @@
 A leaking memory sinks until it is an ON threshold below the light. After a rise a pixel is anywhere
 on that way, and leak events come at their mean rate from the first moment. After a fall it is above
 the light, and they begin later than a period, 1 / leak_hz. All other noise comes after both. What
-leaked until a step is missing in it: its pixels send their ON events sooner.
+leaked until a step brings its ON events forward, and pixels send more of them.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ Span = tuple[int, int]
 
 SURE = 3.0  # standard deviations
 PART = 0.5  # of the mean time between noise events: later leak comes after falls too
-LATE = 1.4  # periods after a fall until leak comes at its mean rate
-# Relative error: pixels that a small rise after a fall leaves without an event leak later, and one
-# bench of .3 Hz came out 7 % low, one of .1 Hz beside as much shot noise 8 %.
-UNEVEN = 0.08
+LATE = 0.9  # periods of leak that a fall delays: half of one, and as much by theta_OFF
+# Relative error: pixels that a small rise after a fall leaves without an event leak later. Of
+# benches with .1 to .5 Hz, beside up to as much other noise.
+UNEVEN = 0.15
 LEAST_EVENTS = 50.0  # OFF events at rest, for the other noise by direction
 
 
@@ -47,16 +47,26 @@ class Leaking:
         without = np.concatenate([[0.5], ~up]) @ np.minimum(seconds, LATE / self.hz)
         return float(seconds.sum() - self.share * without)
 
-    def missing(self, seconds: Array, rests: Array, *, stores: bool) -> Array:
-        """(K, H, W) ON events that the steps lack, less those that leak has sent, if they count.
+    def brought_forward(
+        self, seconds: Array, since: Array, rests: Array, *, stores: bool
+    ) -> Array:
+        """(K, H, W) ON events that leak before the steps adds to them, less those that it has sent
+        at rest, if they count.
 
         Args:
             seconds: (K,) of the rests before the steps.
+            since: (K, H, W) seconds from a pixel's last event at these to their end.
             rests: (K, 2, H, W) events at these.
             stores: whether noise resets the memory, and counting begins anew.
         """
-        due = self.hz * seconds[:, None, None]
-        return due / (1.0 + rests.sum(1)) if stores else due - self.share * rests[:, 0]
+        if stores:
+            return self.hz * since
+        return self.hz * seconds[:, None, None] - self.share * rests[:, 0]
+
+    def theta_error(self, since: Array, counts: Array) -> float:
+        """Relative error of the ON threshold by that of the leak. counts: (K, H, W) ON events of
+        the steps; since: as of `brought_forward`."""
+        return self.std_hz * float(since.sum()) / max(float(counts.sum()), 1.0) if self.hz else 0.0
 
 
 NO_LEAK = Leaking()
@@ -89,15 +99,22 @@ def _by_direction(events: Events, spans: list[Span], up: Array, kept: Array) -> 
     watched, unmoved = seconds[up].sum(), seconds[~up].sum()
     if min(watched, unmoved) <= 0.0:
         return NO_LEAK
-    # Noise that differs with the direction, as by light, does so for OFF events too.
     noise_hz, other, unsure = fallen / unmoved, 1.0, 0.0
-    if min(off_risen, off_fallen) >= LEAST_EVENTS:
-        ratio = abs(np.log(off_risen / watched / (off_fallen / unmoved)))
-        unsure = float(np.sqrt(1.0 / off_risen + 1.0 / off_fallen))
+    if max(off_risen, off_fallen) >= LEAST_EVENTS:
+        # Noise that differs with the direction, as by light, does so for OFF events too.
+        off = np.array([off_risen + 1.0, off_fallen + 1.0])
+        ratio = abs(np.log(off[0] / watched / (off[1] / unmoved)))
+        unsure = float(np.sqrt((1.0 / off).sum()))
         other = float(np.exp(max(ratio - unsure, 0.0)))
-    hz = risen / watched - other * noise_hz
+    # A step that pixels, or the light, still follow at rest goes on in OFF events after falls.
+    following = off_fallen / unmoved - off_risen / watched
+    follow_std = np.sqrt(off_fallen / unmoved**2 + off_risen / watched**2)
+    hz = risen / watched - other * noise_hz - max(following - follow_std, 0.0)
     std_hz = np.sqrt((risen + 1.0) / watched**2 + (fallen + 1.0) * (other / unmoved) ** 2
                      + (unsure * noise_hz) ** 2)
     if hz < SURE * std_hz:
         return NO_LEAK
+    resets = (noise_hz + (off_risen + off_fallen) / (watched + unmoved)) * max(
+        b - a for a, b in spans) * 1e-6
+    hz *= resets / -np.expm1(-resets) if resets > 0 else 1.0  # leak that other noise sets back
     return Leaking(float(hz), float(np.hypot(std_hz, UNEVEN * hz)), float(other * noise_hz))

@@ -6,6 +6,8 @@ first part of a rest is busier than its last third, which is noise.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from evflow.notes import Note
@@ -35,6 +37,11 @@ def settling_us(events: Events, spans: list[Span]) -> tuple[int, list[Note]]:
                 "or take brighter light.")]
         settle = min(round(LONGER * settle), half)
     return settle, []
+
+
+def slow(notes: Iterable[Note]) -> bool:
+    """Whether the pixels are too slow for the rests, by `settling_us`."""
+    return any(note.code == "steps.slow" for note in notes)
 
 
 def _busy(events: Events, spans: list[Span], settle: int) -> bool:

@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 
 from evflow.camera import THETA_MIN
-from evflow.estimation.bench.leaking import NO_LEAK, Leaking
+from evflow.estimation.bench.leaking import Leaking
 from evflow.estimation.pixel_noise import ODD, pixel_rates
 from evflow.recordings.faulty_pixels import hot_at_rest
 
@@ -29,13 +29,13 @@ PASSES = 4
 GOLDEN = 0.6180339887498949
 OUTLIERS = 4.0  # half widths of the distribution beyond which pixels say nothing of the mismatch
 ERROR_OFF = 0.5  # relative error of the pixels' errors, which are of whole counts and few steps
+LEAST_OFF = 50  # OFF events at rest that tell whether noise resets the memory of leaking pixels
 BIAS = 0.015  # relative error of the median threshold: 1.4 % low on eight simulated benches
 
 
 def ratio(
     levels: np.ndarray, n: np.ndarray, strays: np.ndarray, fresh: bool, rests: np.ndarray,
-    lost: np.ndarray, lit: np.ndarray, leaking: Leaking = NO_LEAK,
-    seconds: np.ndarray | None = None,
+    lost: np.ndarray, lit: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """theta = dlogI / events (2, H, W) over the steps of each direction, and the std of one event.
     Arguments as of `regression`."""
@@ -48,8 +48,7 @@ def ratio(
 
 def regression(
     levels: np.ndarray, n: np.ndarray, strays: np.ndarray, fresh: bool, rests: np.ndarray,
-    lost: np.ndarray, lit: np.ndarray, leaking: Leaking = NO_LEAK,
-    seconds: np.ndarray | None = None,
+    lost: np.ndarray, lit: np.ndarray, leak: tuple[Leaking, np.ndarray, np.ndarray] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Thresholds by iterated weighted least squares for (theta_ON, theta_OFF, r_0).
 
@@ -61,8 +60,8 @@ def regression(
         rests: (K+1, 2, H, W) events at the rests.
         lost: (K, H, W) bool, steps whose events are not known.
         lit: (K+1, H, W) bool, rests whose level is known.
-        leaking: of the pixels.
-        seconds: (K+1,) of the rests, of leaking pixels.
+        leak: of the pixels, (K+1,) seconds of the rests, and (K+1, H, W) seconds since a pixel's
+            last event at their end; None without.
 
     Returns:
         theta and its std, (2, H, W).
@@ -70,12 +69,22 @@ def regression(
     noisy = rests.max(1) > 0
     theta, std = _regression(levels, n, strays, fresh, np.zeros_like(noisy), lost, lit)
     up = np.median(np.diff(levels, axis=0), (1, 2)) > 0
-    stores = storing(n, up, noisy, np.median(theta, (1, 2)), lost) > 0.5
-    if not stores and not leaking.hz:
-        return theta, std
-    n = n.copy()
-    if leaking.hz and seconds is not None:
-        n[:, 0] -= leaking.missing(seconds[:-1], rests[:-1], stores=stores)
+    medians = np.median(theta, (1, 2))
+    if leak is None:
+        stores = storing(n, up, noisy, medians, lost) > 0.5
+        if not stores:
+            return theta, std
+        n = n.copy()
+    else:
+        leaking, seconds, since = leak
+        kept, counted = (n - np.stack([v, np.zeros(v.shape)], 1) for v in (
+            leaking.brought_forward(seconds[:-1], since[:-1], rests[:-1], stores=stores)
+            for stores in (True, False)))
+        # An event of the leak itself always sets the memory: OFF noise tells whether others do.
+        by_leak = lost | (rests[:-1, 0] > 0)
+        stores = (rests[:, 1].sum() < LEAST_OFF
+                  or storing(kept, up, rests[:, 1] > 0, medians, by_leak) > 0.5)
+        n = kept if stores else counted
     if stores:
         # A noise event amid a step discards half a threshold of change on average.
         n += (0.5 * strays.sum(1)[:, None] * np.stack([up, ~up], 1))[..., None, None]

@@ -98,10 +98,11 @@ def test_steps_of_one_direction_tell_nothing() -> None:
     assert sent([(0.5, 0.2)] * 4, [True] * 3).hz == 0.0
 
 
-def test_what_steps_lack_is_what_leaked_since_the_memory_was_set() -> None:
+def test_what_leaked_since_the_memory_was_set_adds_to_a_step() -> None:
     found, rests = Leaking(0.4, 0.02, 0.1), np.zeros((2, 2, 1, 2), int)
     rests[1, 0, 0, 1] = 1
-    stored = found.missing(np.array([0.5, 1.0]), rests, stores=True)
-    np.testing.assert_allclose(stored[:, 0], [[0.2, 0.2], [0.4, 0.2]])
-    counted = found.missing(np.array([0.5, 1.0]), rests, stores=False)
+    times = np.array([0.5, 1.0]), np.array([[[0.5, 0.5]], [[1.0, 0.25]]])
+    stored = found.brought_forward(*times, rests, stores=True)
+    np.testing.assert_allclose(stored[:, 0], [[0.2, 0.2], [0.4, 0.1]])
+    counted = found.brought_forward(*times, rests, stores=False)
     np.testing.assert_allclose(counted[:, 0], [[0.2, 0.2], [0.4, 0.4 - 0.8]])
