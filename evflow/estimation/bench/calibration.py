@@ -32,6 +32,8 @@ from evflow.estimation.bench.steps import (
     pixel_and_camera_rates,
     ratio,
     regression,
+    return_error,
+    unrecorded,
 )
 from evflow.estimation.remarks import LOGARITHMIC, dead_notes
 from evflow.estimation.result import THRESHOLDS, CameraEstimate
@@ -96,11 +98,13 @@ def calibrate_step(
     sized = steps.sized
     steps, log_map = _with_right_map(steps, clean[:, :, kept].mean(-1))
     missed = lost_steps(steps.changes, clean[:, :, kept].mean(-1), sized)
-    lost = np.broadcast_to(missed[:, None, None], (len(missed), *kept.shape))
+    unknown = missed | unrecorded(up, steps.counts)
+    lost = np.broadcast_to(unknown[:, None, None], (len(unknown), *kept.shape))
     given = steps.levels, clean, strays, fresh, steps.rests, lost, steps.lit
     theta, error = ratio(*given) if literal else regression(
         *given, (leaking, rests_s, steps.since) if leaking.hz else None)
-    by_leak = np.array([leaking.theta_error(steps.since[:-1], clean[:, 0]), 0.0])
+    shared = np.hypot([leaking.theta_error(steps.since[:-1], clean[:, 0]), 0.0],
+                      return_error(up, clean))
     events = np.where(lost[:, None], 0.0, steps.counts).sum(0)
     enough = (events >= FEW_EVENTS) & (events > 2 * strays.sum(0)[:, None, None])
     enough &= steps.reach > LEAST_STEP
@@ -114,11 +118,11 @@ def calibrate_step(
         if good.any() and good.sum() < MOST * kept.sum():
             # Those with enough events are the ones that happen to send more.
             own = float(np.hypot(own, np.median(error[i][good])))
-        medians.append((median, float(np.hypot(own, by_leak[i] * median))))
+        medians.append((median, float(np.hypot(own, shared[i] * median))))
         spreads.append((spread, spread_error))
         maps.append(np.where(sound[i], theta[i], median))
         stds.append(np.hypot(np.where(sound[i], error[i], np.hypot(spread, own)),
-                             by_leak[i] * maps[i]))
+                             shared[i] * maps[i]))
     eta, eta_std = pixel_and_camera_rates(
         rest, watched_s, dead, leaking.std_hz if leaking.hz else 0.0)
     valid = (sound | ~enough.any((1, 2))[:, None, None]).all(0) & enough.any(0) & kept

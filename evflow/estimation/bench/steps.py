@@ -82,8 +82,8 @@ def regression(
             for stores in (True, False)))
         # An event of the leak itself always sets the memory: OFF noise tells whether others do.
         by_leak = lost | (rests[:-1, 0] > 0)
-        stores = (rests[:, 1].sum() < LEAST_OFF
-                  or storing(kept, up, rests[:, 1] > 0, medians, by_leak) > 0.5)
+        stores = bool(rests[:, 1].sum() < LEAST_OFF) or storing(
+            kept, up, rests[:, 1] > 0, medians, by_leak) > 0.5
         n = kept if stores else counted
     if stores:
         # A noise event amid a step discards half a threshold of change on average.
@@ -112,6 +112,25 @@ def storing(
         weight.append(1.0 / (1.0 / anew.sum() + 1.0 / others.sum()))
     w, x, y = map(np.array, (weight, expected, excess))
     return float((w * x) @ y / ((w * x) @ x)) if len(w) else 0.0
+
+
+def unrecorded(up: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """(K,) bool: the steps of a polarity that the whole recording lacks, whose events no one knows.
+    up: (K,); counts: (K, 2, H, W)."""
+    on, off = (not counts[:, i].any() for i in range(2))
+    return np.where(up, on, off)
+
+
+def return_error(up: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """(2,) relative error of the thresholds of a polarity alone: after each step of the one that is
+    not recorded the memory returns from up to a threshold of that, which is the prior's."""
+    if not unrecorded(up, counts).any():
+        return np.zeros(2)
+    sent = np.maximum(counts.sum((0, 2, 3)), 1.0) / counts[0, 0].size
+    turned = np.diff(up, prepend=up[0])
+    returns = np.array([(turned & up).sum(), (turned & ~up).sum()])
+    error = 0.5 * THETA_PRIOR_STD * returns / sent / THETA_PRIOR
+    return np.where(counts.any((0, 2, 3)), error, 0.0)
 
 
 def _regression(
