@@ -21,7 +21,7 @@ from evflow.camera import Camera
 from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
 from evflow.estimation.pooled import quiet_times
-from evflow.estimation.refine import receptor_sample
+from evflow.estimation.refine import frame_noise, receptor_sample
 from evflow.estimation.refine.stretches import INTERVALS
 from evflow.estimation.result import CameraEstimate
 from evflow.metrics.space_time import space_time_r
@@ -112,8 +112,9 @@ def which_simulator(
     """The pixels on frames of the second run, the nearest first. found: the estimate of the first
     run. Raises EV017 if too little happens."""
     run = tuple(range(*first))
+    noise_dn = frame_noise([(recording, i) for i in run])
     data = receptor_sample([(recording, run[k:k + INTERVALS])
-                            for k in range(0, len(run), INTERVALS)])
+                            for k in range(0, len(run), INTERVALS)], noise_dn)
     learnt, tried = (Film.of(recording, run, most, found.hot)
                      for run, most in ((first, LEARNT), (second, TRIED)))
     if data is None or not len(learnt.real) or not len(tried.real):
