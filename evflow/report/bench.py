@@ -132,6 +132,9 @@ def _summary(found: CameraEstimate, grade: Grade, sentences: list[str]) -> Panel
             rows.append([f"threshold {name}", "not measured", "–"])
     rows += [[f"noise {side.upper()}", spread(*(float(getattr(s, f"eta_{side}")) for s in (
         found.summary, found.summary_std))) + " Hz per pixel", ""] for side in ("on", "off")]
+    if found.sensor.leak_hz:
+        rows.append(["leak, a part of the noise ON", spread(
+            found.sensor.leak_hz, found.sensor_std["leak_hz"]) + " Hz per pixel", ""])
     if found.bench and found.bench.dead.measured:
         rows.append(["dead time", spread(1e3 * found.bench.dead.seconds,
                                          1e3 * found.bench.dead.std_s) + " ms", ""])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +16,7 @@ from evflow.estimation.bench import calibration
 from evflow.estimation.bench.calibration import calibrate_step
 from evflow.estimation.bench.leaking import NO_LEAK, Leaking, measured_leaking
 from evflow.estimation.result import CameraEstimate
+from evflow.report.bench import write_bench_report
 from evflow.types import Events, Recording
 
 LEVELS = [25.0, 225.0, 64.0, 160.0, 40.0, 100.0, 225.0, 40.0, 100.0, 25.0, 64.0, 225.0] * 2
@@ -42,6 +44,16 @@ def test_leak_and_thresholds_are_told_apart(leaking: tuple[Recording, Camera]) -
     assert abs(float(found.summary.eta_on) - LEAK_HZ) < 2 * float(found.summary_std.eta_on)
     assert found.sensor.eta_is_all
     assert "events.gaps" not in [note.code for note in found.notes]
+
+
+def test_the_report_has_the_leak(leaking: tuple[Recording, Camera], tmp_path: Path) -> None:
+    found = calibrate_step(leaking[0])
+    for with_leak in (True, False):
+        shown = found if with_leak else dataclasses.replace(
+            found, sensor=SensorModel(noise_resets_memory=True))
+        path = tmp_path / f"{with_leak}.html"
+        write_bench_report(path, shown, leaking[0])
+        assert ("leak, a part of the noise ON" in path.read_text()) == with_leak
 
 
 def test_leak_taken_for_noise_lowers_the_threshold(
