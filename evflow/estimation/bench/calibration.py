@@ -130,9 +130,10 @@ def calibrate_step(
                       n_events, ~kept, int((~missed).sum()),
                       _notes(steps, undetermined, valid, ~kept, dead, missed),
                       tuple(undetermined))
-    if not leaking.hz and not literal:
-        found = with_fast_edges(
-            found, steps.changes, by_rested(clean, steps.rests, kept & ~dead), sized & ~missed)
+    if not literal:
+        sent = by_rested(clean, steps.rests, kept & ~dead)
+        sent[:, 0] -= leaking.hz * rests_s[:-1]  # all of the leak brings forward what they send
+        found = with_fast_edges(found, steps.changes, sent, sized & ~missed)
     shown = measured_bench(
         steps.unit, recording.events, steps.spans, steps.settled, steps.quiet, steps.light,
         np.median(steps.levels, (1, 2)), steps.rests, clean, kept, np.where(sound, theta, np.nan),
