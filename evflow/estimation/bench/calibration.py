@@ -21,7 +21,7 @@ from evflow.estimation.bench.counting import Span, Steps, counted_steps
 from evflow.estimation.bench.coverage import lost_steps, skipped_notes
 from evflow.estimation.bench.fast_edges import by_rested, with_fast_edges
 from evflow.estimation.bench.latency import measured_latency
-from evflow.estimation.bench.leaking import NO_LEAK, measured_leaking
+from evflow.estimation.bench.leaking import NO_LEAK, Leaking, measured_leaking
 from evflow.estimation.bench.levels import few_sizes, measured_bench
 from evflow.estimation.bench.logarithm import chosen_map
 from evflow.estimation.bench.rests import LEAST_STEP, rests_between
@@ -84,29 +84,101 @@ def calibrate_step(
     if metered:
         steps = dataclasses.replace(steps, unit="lux")
     _check_polarity(steps, recording.has_frames)
-    rest = steps.rest
-    n_events = steps.counts.sum((0, 1)).astype(np.uint32)
-    dead = dead_pixels(n_events)
-    up, rests_s = steps.changes > 0, steps.rests_s
-    kept = camera_rate(rest, np.full(2, steps.rest_s), dead)[1]
+    signal = _without_noise(recording, steps)
+    steps, log_map = _with_right_map(steps, signal.mean)
+    missed = lost_steps(steps.changes, signal.mean, steps.sized)
+    measured = _thresholds(steps, signal, missed, fresh=fresh, literal=literal)
+    found, known = _estimate(steps, signal, measured, missed), steps.sized & ~missed
+    if not literal:
+        sent = by_rested(signal.clean, steps.rests, signal.used)
+        # All of the leak brings forward what these send.
+        sent[:, 0] -= signal.leaking.hz * steps.rests_s[:-1]
+        found = with_fast_edges(found, steps.changes, sent, known)
+    logs = np.median(steps.levels, (1, 2))
+    shown = measured_bench(
+        steps.unit, recording.events, steps.spans, steps.settled, steps.quiet, steps.light, logs,
+        steps.rests, signal.clean, signal.kept, np.where(measured.sound, measured.own, np.nan),
+        known, not slow(steps.notes))
+    if triggers_us is not None:
+        shown = dataclasses.replace(shown, latency=measured_latency(
+            recording.events, triggers_us, steps.spans, steps.settled, steps.light, logs,
+            signal.kept))
+    leaking = signal.leaking
+    return dataclasses.replace(
+        found, bench=shown,
+        sensor_std={"refractory_s": shown.dead.std_s, "leak_hz": leaking.std_hz},
+        sensor=dataclasses.replace(
+            found.sensor, refractory_s=shown.dead.seconds, log_map=log_map, leak_hz=leaking.hz,
+            eta_is_all=leaking.hz > 0))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Signal:
+    """Events of K steps without the noise.
+
+    clean: (K, 2, H, W); strays: (K, 2) noise events that were taken off; kept: (H, W) bool, pixels
+    that are not hot; dead: (H, W) bool; watched_s: (2,) seconds at rest in which noise of either
+    polarity comes at its mean rate."""
+
+    clean: np.ndarray
+    strays: np.ndarray
+    kept: np.ndarray
+    dead: np.ndarray
+    leaking: Leaking
+    watched_s: np.ndarray
+
+    @property
+    def used(self) -> np.ndarray:
+        """(H, W) bool: neither hot nor dead."""
+        return self.kept & ~self.dead
+
+    @property
+    def mean(self) -> np.ndarray:
+        """(K, 2) events per pixel."""
+        return np.asarray(self.clean[:, :, self.kept].mean(-1))
+
+
+def _without_noise(recording: Recording, steps: Steps) -> _Signal:
+    dead, up = dead_pixels(steps.n_events), steps.changes > 0
+    kept = camera_rate(steps.rest, np.full(2, steps.rest_s), dead)[1]
     leaking = NO_LEAK if slow(steps.notes) else measured_leaking(
         recording.events, steps.quiet, up, kept & ~dead)
-    watched_s = np.array([leaking.watched(rests_s, up), steps.rest_s])
-    hz = camera_rate(rest, watched_s, dead)[0]
-    strays = steps.seconds[:, None] * hz
+    watched_s = np.array([leaking.watched(steps.rests_s, up), steps.rest_s])
+    strays = steps.seconds[:, None] * camera_rate(steps.rest, watched_s, dead)[0]
     clean = np.maximum(steps.counts - strays[..., None, None], 0.0)
-    sized = steps.sized
-    steps, log_map = _with_right_map(steps, clean[:, :, kept].mean(-1))
-    missed = lost_steps(steps.changes, clean[:, :, kept].mean(-1), sized)
+    return _Signal(clean, strays, kept, dead, leaking, watched_s)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Thresholds:
+    """own: (2, H, W) of each pixel, as measured; sound, enough: (2, H, W) bool, whether that is a
+    threshold, and whether it sent enough events; maps, stds: (2, H, W), the camera's median where
+    not; medians, spreads: of ON and OFF, with their std; undetermined: names."""
+
+    own: np.ndarray
+    sound: np.ndarray
+    enough: np.ndarray
+    maps: np.ndarray
+    stds: np.ndarray
+    medians: list[tuple[float, float]]
+    spreads: list[tuple[float, float]]
+    undetermined: tuple[str, ...]
+
+
+def _thresholds(
+    steps: Steps, signal: _Signal, missed: np.ndarray, *, fresh: bool, literal: bool
+) -> _Thresholds:
+    """missed: (K,) bool, steps whose events are lost; other arguments as of `calibrate_step`."""
+    up, kept, leaking = steps.changes > 0, signal.kept, signal.leaking
     unknown = missed | unrecorded(up, steps.counts)
     lost = np.broadcast_to(unknown[:, None, None], (len(unknown), *kept.shape))
-    given = steps.levels, clean, strays, fresh, steps.rests, lost, steps.lit
+    given = steps.levels, signal.clean, signal.strays, fresh, steps.rests, lost, steps.lit
     theta, error = ratio(*given) if literal else regression(
-        *given, (leaking, rests_s, steps.since) if leaking.hz else None)
-    shared = np.hypot([leaking.theta_error(steps.since[:-1], clean[:, 0]), 0.0],
-                      return_error(up, clean))
+        *given, (leaking, steps.rests_s, steps.since) if leaking.hz else None)
+    shared = np.hypot([leaking.theta_error(steps.since[:-1], signal.clean[:, 0]), 0.0],
+                      return_error(up, signal.clean))
     events = np.where(lost[:, None], 0.0, steps.counts).sum(0)
-    enough = (events >= FEW_EVENTS) & (events > 2 * strays.sum(0)[:, None, None])
+    enough = (events >= FEW_EVENTS) & (events > 2 * signal.strays.sum(0)[:, None, None])
     enough &= steps.reach > LEAST_STEP
     sound = enough & (theta >= THETA_MIN) & (error < theta)  # false where either is NaN
     maps, stds, medians, spreads, undetermined = [], [], [], [], list[str]()
@@ -123,31 +195,8 @@ def calibrate_step(
         maps.append(np.where(sound[i], theta[i], median))
         stds.append(np.hypot(np.where(sound[i], error[i], np.hypot(spread, own)),
                              shared[i] * maps[i]))
-    eta, eta_std = pixel_and_camera_rates(
-        rest, watched_s, dead, leaking.std_hz if leaking.hz else 0.0)
-    valid = (sound | ~enough.any((1, 2))[:, None, None]).all(0) & enough.any(0) & kept
-    found = _estimate(np.stack(maps), np.stack(stds), medians, spreads, eta, eta_std, valid,
-                      n_events, ~kept, int((~missed).sum()),
-                      _notes(steps, undetermined, valid, ~kept, dead, missed),
-                      tuple(undetermined))
-    if not literal:
-        sent = by_rested(clean, steps.rests, kept & ~dead)
-        sent[:, 0] -= leaking.hz * rests_s[:-1]  # all of the leak brings forward what they send
-        found = with_fast_edges(found, steps.changes, sent, sized & ~missed)
-    shown = measured_bench(
-        steps.unit, recording.events, steps.spans, steps.settled, steps.quiet, steps.light,
-        np.median(steps.levels, (1, 2)), steps.rests, clean, kept, np.where(sound, theta, np.nan),
-        sized & ~missed, not slow(steps.notes))
-    if triggers_us is not None:
-        shown = dataclasses.replace(shown, latency=measured_latency(
-            recording.events, triggers_us, steps.spans, steps.settled,
-            steps.light, np.median(steps.levels, (1, 2)), kept))
-    return dataclasses.replace(
-        found, bench=shown,
-        sensor_std={"refractory_s": shown.dead.std_s, "leak_hz": leaking.std_hz},
-        sensor=dataclasses.replace(
-            found.sensor, refractory_s=shown.dead.seconds, log_map=log_map, leak_hz=leaking.hz,
-            eta_is_all=leaking.hz > 0))
+    return _Thresholds(theta, sound, enough, np.stack(maps), np.stack(stds), medians, spreads,
+                       tuple(undetermined))
 
 
 def _with_right_map(steps: Steps, sent: np.ndarray) -> tuple[Steps, LogMap]:
@@ -202,18 +251,18 @@ def _check_polarity(steps: Steps, framed: bool) -> None:
 
 
 def _estimate(
-    theta: np.ndarray, theta_std: np.ndarray, medians: list[tuple[float, float]],
-    spreads: list[tuple[float, float]], eta: np.ndarray,
-    of_eta: tuple[np.ndarray, list[tuple[float, float]]],
-    valid: np.ndarray, n_events: np.ndarray, hot: np.ndarray, count: int, notes: tuple[Note, ...],
-    undetermined: tuple[str, ...],
+    steps: Steps, signal: _Signal, measured: _Thresholds, missed: np.ndarray
 ) -> CameraEstimate:
-    eta_std, rates = of_eta
-    values = [*(m for m, _ in medians), *(m for m, _ in rates), *(m for m, _ in spreads)]
-    errors = [*(s for _, s in medians), *(s for _, s in rates),
-              *(s for _, s in spreads)]
+    leaking, enough, sound, kept = signal.leaking, measured.enough, measured.sound, signal.kept
+    eta, (eta_std, rates) = pixel_and_camera_rates(
+        steps.rest, signal.watched_s, signal.dead, leaking.std_hz if leaking.hz else 0.0)
+    silent = np.array([not side.any() for side in enough])
+    valid = (sound | silent[:, None, None]).all(0) & enough.any(0) & kept
+    values, errors = zip(*measured.medians, *rates, *measured.spreads, strict=True)
     return CameraEstimate(
-        Camera(*(jnp.asarray(m, jnp.float32) for m in (*theta, *eta))).validate(),
-        Camera(*(jnp.asarray(m, jnp.float32) for m in (*theta_std, *eta_std))),
+        Camera(*(jnp.asarray(m, jnp.float32) for m in (*measured.maps, *eta))).validate(),
+        Camera(*(jnp.asarray(m, jnp.float32) for m in (*measured.stds, *eta_std))),
         Summary(*(jnp.float32(v) for v in values)), Summary(*(jnp.float32(e) for e in errors)),
-        valid, n_events, hot, dead_pixels(n_events), count, notes, undetermined)
+        valid, steps.n_events, ~kept, signal.dead, int((~missed).sum()),
+        _notes(steps, measured.undetermined, valid, ~kept, signal.dead, missed),
+        measured.undetermined)

@@ -67,6 +67,11 @@ class Steps:
         return self.rests.sum(0, dtype=np.float64)
 
     @property
+    def n_events(self) -> np.ndarray:
+        """(H, W) uint32 events of all steps."""
+        return self.counts.sum((0, 1)).astype(np.uint32)
+
+    @property
     def rests_s(self) -> np.ndarray:
         """(K+1,) seconds of counting at each rest."""
         return np.array([b - a for a, b in self.quiet]) * 1e-6
