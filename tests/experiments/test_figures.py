@@ -45,7 +45,7 @@ def readme() -> dict[str, Figures]:
 
 def held_of_theta() -> Figures:
     return [end for column in ("within 68", "within 95")
-            for end in span("evaluate", r"0.\d+( v2e)?\|theta", column)]
+            for end in span("evaluate", r"0.\d+( v2e| free noise)?\|theta", column)]
 
 
 def all_cameras() -> Figures:
@@ -205,7 +205,7 @@ def generate() -> dict[str, Figures]:
     return {"events relative to the simulator": ends(whole, 1, 2),
             "the same, thresholds of single pixels halved": ends("single pixels halved", 1, 2),
             "the same, thresholds of single pixels doubled": ends("single pixels doubled", 1, 2),
-            "correlation with a simulation": ends(every, 6)}
+            "correlation with a simulation": [*ends(every, 6), *ends(".*from the first", 6)]}
 
 
 def changes() -> dict[str, Figures]:
