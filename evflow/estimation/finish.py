@@ -136,7 +136,8 @@ def estimate(
     camera, error, summary, std = maps.with_rates(camera, error, sent, hot, summary, std)
     if hot.any():
         camera, error = maps.with_hot_rates(
-            camera, error, hot, *hot_rates(sent, state.sent, state.seconds, hot))
+            camera, error, hot, *hot_rates(
+                sent, state.sent, state.seconds, hot, alone=shot.falls))
     as_sent = summary
     if lost := front_end.lost:
         camera, error, summary, std = maps.with_contrast_lost(

@@ -136,24 +136,30 @@ def pixel_rates(
 
 
 def hot_rates(
-    quiet: Array, sent: Array, seconds: float, hot: Array
+    quiet: Array, sent: Array, seconds: float, hot: Array, *, alone: bool = False
 ) -> tuple[Array, Array]:
     """Noise rates (2, N) in Hz of the hot (H, W) pixels, and their std.
 
     What they send while nothing happens near them, quiet (2, 2, H, W) of `quiet_time`, and, as
-    where the whole scene moves nothing ever rests, what they send beyond the median of their
-    neighbours in all the `seconds`, sent (2, H, W) ON and OFF, with the neighbours' spread: both
-    weighted by their precision."""
+    where the whole scene moves nothing ever rests, what they send in the rest of the `seconds`
+    beyond the median of their neighbours, whose spread is in its error; both weighted by their
+    precision. sent (2, H, W): ON and OFF events. alone: the former alone where there is any, as its
+    rates are at another light than the latter."""
     rates, stds = [], []
     for (events, watched), own in zip(quiet, sent.astype(np.float32), strict=True):
         usual = cv2.medianBlur(np.where(hot, 0.0, own).astype(np.float32), BESIDE)
         spread = cv2.medianBlur(np.abs(own - usual), BESIDE)[hot]
-        beyond = np.maximum(own - usual, 0.0)[hot] / seconds
-        beyond_std = np.sqrt(own[hot] + 1.0 + (1.5 * spread) ** 2) / seconds
-        n, alone = events[hot].astype(np.float64), np.maximum(watched[hot], 1e-9)
-        weight = np.stack([alone**2 / (n + 1.0), beyond_std**-2.0])
-        rates.append((weight * [n / alone, beyond]).sum(0) / weight.sum(0))
-        stds.append(weight.sum(0) ** -0.5)
+        n, rested = events[hot].astype(np.float64), watched[hot].astype(np.float64)
+        busy = np.maximum(seconds - rested, 1e-9)
+        left = np.maximum(own[hot] - n, 0.0)
+        beyond = np.maximum(left - usual[hot], 0.0) / busy
+        error = np.sqrt(left + 1.0 + (1.5 * spread) ** 2) / busy
+        weight = np.stack([rested**2 / (n + 1.0), error**-2.0])
+        if alone:
+            weight[1, rested > 0] = 0.0
+        total = weight.sum(0)
+        rates.append((weight * [n / np.maximum(rested, 1e-9), beyond]).sum(0) / total)
+        stds.append(total**-0.5)
     return np.stack(rates), np.stack(stds)
 
 

@@ -277,3 +277,18 @@ def test_what_hot_pixels_send_at_rest_counts_by_its_precision() -> None:
     assert on_std < 1.0
     assert off < 0.1
     assert 0.02 < off_std < 0.06
+
+
+def test_quiet_time_is_counted_once() -> None:
+    """Of pixels that are quiet all the time, quiet events are all that they send."""
+    rng, shape = np.random.default_rng(2), (60, 80)
+    hot = np.zeros(shape, bool)
+    hot[4::8, 4::8] = True
+    sent = np.where(hot, rng.poisson(600.0, (2, *shape)), rng.poisson(3.0, (2, *shape)))
+    quiet = np.stack([sent, np.full(sent.shape, 30.0)], 1)
+    for alone in (False, True):
+        rate, std = hot_rates(quiet, sent, 30.0, hot, alone=alone)
+        assert 0.85 < ((rate - 20.0) / std).std() < 1.15
+    quiet[:, 0] *= 2.0  # at another light
+    np.testing.assert_allclose(hot_rates(quiet, sent, 30.0, hot, alone=True)[0],
+                               sent[:, hot] / 15.0)

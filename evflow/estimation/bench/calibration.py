@@ -27,6 +27,7 @@ from evflow.estimation.bench.logarithm import chosen_map
 from evflow.estimation.bench.rests import LEAST_STEP, rests_between
 from evflow.estimation.bench.settling import slow
 from evflow.estimation.bench.steps import (
+    THETA_PRIOR,
     camera_rate,
     camera_wide,
     pixel_and_camera_rates,
@@ -86,7 +87,8 @@ def calibrate_step(
     _check_polarity(steps, recording.has_frames)
     signal = _without_noise(recording, steps)
     steps, log_map = _with_right_map(steps, signal.mean)
-    missed = lost_steps(steps.changes, signal.mean, steps.sized)
+    missed = lost_steps(steps.changes, signal.mean, steps.sized) & ~unrecorded(
+        steps.changes > 0, steps.counts)
     measured = _thresholds(steps, signal, missed, fresh=fresh, literal=literal)
     found, known = _estimate(steps, signal, measured, missed), steps.sized & ~missed
     if not literal:
@@ -172,10 +174,13 @@ def _thresholds(
     up, kept, leaking = steps.changes > 0, signal.kept, signal.leaking
     unknown = missed | unrecorded(up, steps.counts)
     lost = np.broadcast_to(unknown[:, None, None], (len(unknown), *kept.shape))
-    given = steps.levels, signal.clean, signal.strays, fresh, steps.rests, lost, steps.lit
+    rests = np.where(kept, steps.rests, 0)  # hot pixels tell nothing of what noise does
+    given = steps.levels, signal.clean, signal.strays, fresh, rests, lost, steps.lit
     theta, error = ratio(*given) if literal else regression(
         *given, (leaking, steps.rests_s, steps.since) if leaking.hz else None)
-    shared = np.hypot([leaking.theta_error(steps.since[:-1], signal.clean[:, 0]), 0.0],
+    usual = np.array([np.median(t[known]) if (known := kept & np.isfinite(t)).any() else
+                      THETA_PRIOR for t in theta])
+    shared = np.hypot(leaking.theta_error(steps.since[:-1], signal.clean, usual),
                       return_error(up, signal.clean))
     events = np.where(lost[:, None], 0.0, steps.counts).sum(0)
     enough = (events >= FEW_EVENTS) & (events > 2 * signal.strays.sum(0)[:, None, None])

@@ -38,7 +38,7 @@ class Steps:
     levels: (K+1, H, W) log intensity at each rest; lit: (K+1, H, W) bool, where it is known, as the
     frames are neither saturated nor black; counts: (K, 2, H, W) ON and OFF events of each
     step; seconds: (K,) counting time of each; rests: (K+1, 2, H, W) events at each rest; since:
-    (K+1, H, W) seconds from the last of these, or from the begin, to the rest's end; spans: the
+    (K+1, H, W) seconds from the last event at each, or its begin, to its end; spans: the
     rests; settled: times until which events belong to the step that leads to a rest; quiet: the
     parts of the rests in which events were counted as noise; light: (K+1,) in unit;
     uncovered, silent_s: steps beyond the events, and time at rest whose events are missing, both
@@ -141,7 +141,7 @@ def counted_steps(
     quiet = [watched(events, *of_rest) for of_rest in zip(rested, noise, late, strict=True)]
     silent = sum(b - a for a, b in rested) - sum(b - a for a, b in quiet)
     rests = np.stack([events.slice(a, b).count_map() for a, b in quiet])
-    since = np.stack([_since_last(events.slice(a, b), a, b) for a, b in quiet])
+    since = np.stack([_since_last(events.slice(a, b), a, b) for a, b in rested])
     busiest = max((events.slice(a, b) for a, b in quiet), key=len)
     shown = (np.asarray(light, np.float64) if light is not None else
              np.asarray(lin_log_inverse(jnp.asarray(np.median(levels, (1, 2)))), np.float64))

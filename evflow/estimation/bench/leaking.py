@@ -63,10 +63,14 @@ class Leaking:
             return self.hz * since
         return self.hz * seconds[:, None, None] - self.share * rests[:, 0]
 
-    def theta_error(self, since: Array, counts: Array) -> float:
-        """Relative error of the ON threshold by that of the leak. counts: (K, H, W) ON events of
-        the steps; since: as of `brought_forward`."""
-        return self.std_hz * float(since.sum()) / max(float(counts.sum()), 1.0) if self.hz else 0.0
+    def theta_error(self, since: Array, counts: Array, theta: Array) -> Array:
+        """(2,) relative errors of the thresholds theta (2,) by that of the leak, which a fall must
+        make up for as well. counts: (K, 2, H, W) events of the steps; since: as of
+        `brought_forward`."""
+        if not self.hz:
+            return np.zeros(2)
+        sent = np.maximum(counts.sum((0, 2, 3)), 1.0)
+        return np.asarray(self.std_hz * since.sum() / sent * theta[0] / theta)
 
 
 NO_LEAK = Leaking()

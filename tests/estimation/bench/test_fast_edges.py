@@ -9,7 +9,7 @@ from helpers.benches import SHAPE, cameras, screen
 from evflow.camera import Camera
 from evflow.estimation.bench import calibration
 from evflow.estimation.bench.calibration import calibrate_step
-from evflow.estimation.bench.fast_edges import kept_by_small_steps
+from evflow.estimation.bench.fast_edges import kept_by_small_steps, with_fast_edges
 from evflow.estimation.result import CameraEstimate
 from evflow.types import Events, Recording
 
@@ -77,3 +77,17 @@ def test_too_few_steps_tell_nothing() -> None:
     assert kept_by_small_steps(changes, sent, np.full(2, 0.25), np.ones(4, bool)) is None
     assert kept_by_small_steps(np.tile(changes[:2], 8), np.tile(sent[:2], (8, 1)),
                                np.full(2, 0.25), np.ones(16, bool)) is None
+
+
+def test_absurd_thresholds_of_vanishing_steps_are_in_the_errors_alone() -> None:
+    """Levels that are wrong, as by a black level, look alike."""
+    found, _ = measured(0.0, 20)
+    theta = np.array([float(found.summary.theta_on), float(found.summary.theta_off)])
+    changes = np.array([0.7, -0.7, 1.4, -1.4, 0.9, -0.9, 1.1, -1.1] * 2)
+    sizes = np.abs(changes) - 0.5 * theta.sum()
+    n = sizes / (0.2 * theta.mean() + 0.25 * np.abs(changes))
+    sent = np.where((changes > 0)[:, None], np.stack([n, 0 * n], 1), np.stack([0 * n, n], 1))
+    told = with_fast_edges(found, changes, sent, np.ones(16, bool))
+    assert "The former is given" in told.notes[-1].text
+    assert told.summary.theta_on == found.summary.theta_on
+    assert float(told.summary_std.theta_on) > 0.2 * theta[0]
