@@ -77,6 +77,7 @@ NOTES: dict[str, str] = {
     "scene.restless": "the light varies when it should be constant",
     "steps.fast": "large steps of light send fewer events than small ones foretell",
     "steps.slow": "pixels are too slow for the rests between steps",
+    "steps.small": "steps of light are of few thresholds",
     "steps.skipped": "steps of the light were left out",
     "theta.guessed": "thresholds depend on a network's guess of the contrast",
     "reading.again": "a running camera was measured again, from the pieces that were kept",

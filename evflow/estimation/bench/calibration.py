@@ -22,7 +22,7 @@ from evflow.estimation.bench.coverage import lost_steps, skipped_notes
 from evflow.estimation.bench.fast_edges import by_rested, with_fast_edges
 from evflow.estimation.bench.latency import measured_latency
 from evflow.estimation.bench.leaking import NO_LEAK, Leaking, measured_leaking
-from evflow.estimation.bench.levels import few_sizes, measured_bench
+from evflow.estimation.bench.levels import few_sizes, measured_bench, size_error, small_steps
 from evflow.estimation.bench.logarithm import chosen_map
 from evflow.estimation.bench.rests import LEAST_STEP, rests_between
 from evflow.estimation.bench.settling import slow
@@ -155,7 +155,8 @@ def _without_noise(recording: Recording, steps: Steps) -> _Signal:
 class _Thresholds:
     """own: (2, H, W) of each pixel, as measured; sound, enough: (2, H, W) bool, whether that is a
     threshold, and whether it sent enough events; maps, stds: (2, H, W), the camera's median where
-    not; medians, spreads: of ON and OFF, with their std; undetermined: names."""
+    not; medians, spreads: of ON and OFF, with their std; undetermined: names; by_size: (2,)
+    relative errors as steps are small."""
 
     own: np.ndarray
     sound: np.ndarray
@@ -165,6 +166,7 @@ class _Thresholds:
     medians: list[tuple[float, float]]
     spreads: list[tuple[float, float]]
     undetermined: tuple[str, ...]
+    by_size: np.ndarray
 
 
 def _thresholds(
@@ -182,6 +184,8 @@ def _thresholds(
                       THETA_PRIOR for t in theta])
     shared = np.hypot(leaking.theta_error(steps.since[:-1], signal.clean, usual),
                       return_error(up, signal.clean))
+    by_size = size_error(steps.changes, usual, steps.sized & ~unknown)
+    shared = np.hypot(shared, by_size)
     events = np.where(lost[:, None], 0.0, steps.counts).sum(0)
     enough = (events >= FEW_EVENTS) & (events > 2 * signal.strays.sum(0)[:, None, None])
     enough &= steps.reach > LEAST_STEP
@@ -201,7 +205,7 @@ def _thresholds(
         stds.append(np.hypot(np.where(sound[i], error[i], np.hypot(spread, own)),
                              shared[i] * maps[i]))
     return _Thresholds(theta, sound, enough, np.stack(maps), np.stack(stds), medians, spreads,
-                       tuple(undetermined))
+                       tuple(undetermined), by_size)
 
 
 def _with_right_map(steps: Steps, sent: np.ndarray) -> tuple[Steps, LogMap]:
@@ -269,5 +273,6 @@ def _estimate(
         Camera(*(jnp.asarray(m, jnp.float32) for m in (*measured.stds, *eta_std))),
         Summary(*(jnp.float32(v) for v in values)), Summary(*(jnp.float32(e) for e in errors)),
         valid, steps.n_events, ~kept, signal.dead, int((~missed).sum()),
-        _notes(steps, measured.undetermined, valid, ~kept, signal.dead, missed),
+        (*_notes(steps, measured.undetermined, valid, ~kept, signal.dead, missed),
+         *small_steps(measured.by_size)),
         measured.undetermined)

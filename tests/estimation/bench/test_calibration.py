@@ -43,7 +43,8 @@ def test_steps_tell_every_pixels_thresholds(levels: list[float], mismatch: float
         off, sigmas = errors(found, camera, name)
         assert abs(off.mean()) < 0.003
         assert np.abs(off).mean() < 0.015
-        assert 0.7 < np.sqrt((sigmas**2).mean()) < 1.4
+        # The errors of small steps allow for noise, which this camera has not.
+        assert (0.7 if levels is CYCLES else 0.3) < np.sqrt((sigmas**2).mean()) < 1.4
         assert errors(literal, camera, name)[0].mean() > 0.02
         true = np.median(getattr(camera, name))
         assert float(getattr(found.summary, name)) == pytest.approx(true, abs=0.012)

@@ -130,7 +130,7 @@ def test_levels_that_saturated_frames_hide_are_not_used(whole: Recording, column
     check(found)
     theta = np.median(np.asarray(found.camera.theta_on)[:, :columns])
     assert theta == pytest.approx(0.25, rel=0.07)
-    assert [n.code for n in found.notes] == ["levels.clipped"] * (columns == 32)
+    assert [n.code for n in found.notes] == ["levels.clipped", "steps.small"] * (columns == 32)
     assert found.bench is not None
     assert len(found.bench.steps) == (6 if columns == 32 else 12)
 
