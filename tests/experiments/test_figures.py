@@ -223,14 +223,13 @@ def video() -> dict[str, Figures]:
              "thresholds log-uniform": "wide-log", "estimate": "evflow", "truth": "oracle",
              "LGAN": "lgan", "ECC median": "ecc median", "count matching": "match", "S2R": "s2r",
              "JAER": "jaer"}
-    scored = {"default": [("LPIPS", 2), ("MSE", 2)], "ecc median": [], "jaer": []}
 
     def of(name: str) -> Figures:
         gain = [] if name == "default" else [
-            values("see_better", rf"SSIM\|{name} \(5\)", "to default", k)[0] for k in range(2)]
+            values("see_better", rf"SSIM\|{name} \(3\)", "to default", k)[0] for k in range(2)]
         return [*([0.0] if name == "default" else gain), *(
-            values("see_better", rf"{measure}\|{name} \(5\)", column)[0]
-            for measure, column in scored.get(name, [("LPIPS", 2), ("MSE", 2)]))]
+            values("see_better", rf"{measure}\|{name} \(3\)", column)[0]
+            for measure, column in (("LPIPS", 2), ("MSE", 2)))]
 
     return {label: of(name) for label, name in names.items()}
 
