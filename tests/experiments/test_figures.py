@@ -271,9 +271,9 @@ def circuit() -> dict[str, Figures]:
 
     def of(name: str) -> Figures:
         gain = [0.0] if name == "default" else [
-            values("see_better_circuit", rf"SSIM\|{name} \(5\)", "to default", k)[0]
+            values("see_better_circuit", rf"SSIM\|{name} \(3\)", "to default", k)[0]
             for k in range(2)]
-        return [*gain, *(values("see_better_circuit", rf"{measure}\|{name} \(5\)", "mean")[0]
+        return [*gain, *(values("see_better_circuit", rf"{measure}\|{name} \(3\)", "mean")[0]
                          for measure in ("LPIPS", "MSE"))]
 
     return {label: of(name) for label, name in names.items()}
