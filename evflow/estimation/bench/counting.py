@@ -136,8 +136,7 @@ def counted_steps(
     seconds = [(after - before[1]) * 1e-6
                for before, after in zip(spans, settled[1:], strict=False)]
     rested = [(a, b) for a, (_, b) in zip(settled, spans, strict=True)]
-    fallen = np.concatenate([[False], np.diff(np.median(levels, (1, 2))) < 0])
-    late = fallen * SILENT * _between_off(events, rested)
+    late = np.concatenate([[False], ~up])[inside] * SILENT * _between_off(events, rested)
     quiet = [watched(events, *of_rest) for of_rest in zip(rested, noise, late, strict=True)]
     silent = sum(b - a for a, b in rested) - sum(b - a for a, b in quiet)
     rests = np.stack([events.slice(a, b).count_map() for a, b in quiet])
