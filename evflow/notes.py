@@ -65,6 +65,8 @@ NOTES: dict[str, str] = {
     "frames.unit": "the unit of the frame times was inferred",
     "frames.unused": "frames were left out",
     "frames.white": "the value that counts as white",
+    "levels.added": "pixels see more or less light than the levels say",
+    "levels.black": "whether pixels see more or less light than the levels say is open",
     "levels.clipped": "saturated or black frames hide a level of light",
     "levels.dark": "which logarithm dark levels of light have is open",
     "levels.few": "all light steps have the same size",

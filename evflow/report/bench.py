@@ -38,7 +38,7 @@ UNITS = {"DN": "DN", "lux": "lux", "light": ""}
 BOUNDS = (f"Good (green): thresholds known to {ERROR[0]:.0%}, and no note that impairs them. "
           f"Poor (red): errors above {ERROR[1]:.0%}, or light that is not constant between steps.")
 GRAVE: dict[str, Grade] = {"scene.restless": "poor", "pixels.unsure": "fair", "levels.few": "fair",
-                          "levels.dark": "fair", "steps.slow": "poor",
+                          "levels.dark": "fair", "levels.black": "fair", "steps.slow": "poor",
                           "steps.fast": "fair", "steps.small": "fair"}
 FEW_NOISE = 100  # noise events of a polarity: with fewer, the rate's error exceeds a tenth
 

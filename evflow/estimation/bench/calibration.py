@@ -17,6 +17,7 @@ import numpy as np
 from evflow.camera import THETA_MIN, Camera, Summary
 from evflow.camera.sensors import LogMap
 from evflow.errors import EvflowDataError
+from evflow.estimation.bench.added_light import AddedLight, with_added_light
 from evflow.estimation.bench.counting import Span, Steps, counted_steps
 from evflow.estimation.bench.coverage import lost_steps, skipped_notes
 from evflow.estimation.bench.fast_edges import by_rested, with_fast_edges
@@ -89,12 +90,20 @@ def calibrate_step(
     steps, log_map = _with_right_map(steps, signal.mean)
     missed = lost_steps(steps.changes, signal.mean, steps.sized) & ~unrecorded(
         steps.changes > 0, steps.counts)
+    known = steps.sized & ~missed
+    sent = by_rested(signal.clean, steps.rests, signal.used)
+    # All of the leak brings forward what these send.
+    sent[:, 0] -= signal.leaking.hz * steps.rests_s[:-1]
     measured = _thresholds(steps, signal, missed, fresh=fresh, literal=literal)
-    found, known = _estimate(steps, signal, measured, missed), steps.sized & ~missed
+    added = AddedLight()
     if not literal:
-        sent = by_rested(signal.clean, steps.rests, signal.used)
-        # All of the leak brings forward what these send.
-        sent[:, 0] -= signal.leaking.hz * steps.rests_s[:-1]
+        steps, added, by_light = with_added_light(
+            steps, log_map, *measured.camera_wide, sent, known)
+        if added.amount:
+            measured = _thresholds(steps, signal, missed, fresh=fresh)
+        measured = measured.with_error(by_light)
+    found = _estimate(steps, signal, measured, missed)
+    if not literal:
         found = with_fast_edges(found, steps.changes, sent, known)
     logs = np.median(steps.levels, (1, 2))
     shown = measured_bench(
@@ -107,7 +116,7 @@ def calibrate_step(
             signal.kept))
     leaking = signal.leaking
     return dataclasses.replace(
-        found, bench=shown,
+        found, bench=shown, optics=added.optics(steps.unit),
         sensor_std={"refractory_s": shown.dead.std_s, "leak_hz": leaking.std_hz},
         sensor=dataclasses.replace(
             found.sensor, refractory_s=shown.dead.seconds, log_map=log_map, leak_hz=leaking.hz,
@@ -168,9 +177,21 @@ class _Thresholds:
     undetermined: tuple[str, ...]
     by_size: np.ndarray
 
+    @property
+    def camera_wide(self) -> tuple[np.ndarray, np.ndarray]:
+        """(2,) medians and (2,) spreads."""
+        return np.array(self.medians)[:, 0], np.array(self.spreads)[:, 0]
+
+    def with_error(self, shared: np.ndarray) -> _Thresholds:
+        """Wider by the relative errors (2,) of ON and OFF, which all pixels share."""
+        return dataclasses.replace(
+            self, stds=np.hypot(self.stds, shared[:, None, None] * self.maps),
+            medians=[(value, float(np.hypot(std, error * value)))
+                     for (value, std), error in zip(self.medians, shared, strict=True)])
+
 
 def _thresholds(
-    steps: Steps, signal: _Signal, missed: np.ndarray, *, fresh: bool, literal: bool
+    steps: Steps, signal: _Signal, missed: np.ndarray, *, fresh: bool, literal: bool = False
 ) -> _Thresholds:
     """missed: (K,) bool, steps whose events are lost; other arguments as of `calibrate_step`."""
     up, kept, leaking = steps.changes > 0, signal.kept, signal.leaking

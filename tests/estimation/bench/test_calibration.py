@@ -16,7 +16,6 @@ from evflow import Recording
 from evflow.camera import Camera
 from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
-from evflow.estimation.bench import levels as of_levels
 from evflow.estimation.bench.calibration import calibrate_step
 from evflow.estimation.bench.rests import find_rests, steps_of_light
 from evflow.estimation.bench.steps import storing
@@ -31,13 +30,11 @@ def errors(found, camera: Camera, name: str) -> tuple[np.ndarray, np.ndarray]:
     return off[found.valid], (off / np.asarray(getattr(found.std, name)))[found.valid]
 
 
+@pytest.mark.usefixtures("known_levels", "even_remainders")
 @pytest.mark.parametrize("levels", [CYCLES, STAIRS, [25, 225, 25]], ids=["cycles", "stairs", "two"])
 @pytest.mark.parametrize("mismatch", [0.03, 0.1])
-def test_steps_tell_every_pixels_thresholds(
-    levels: list[float], mismatch: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_steps_tell_every_pixels_thresholds(levels: list[float], mismatch: float) -> None:
     """Unbiased to .003, each pixel within its std; the literal ratio is biased by .02 and more."""
-    monkeypatch.setattr(of_levels, "SIZE_ERROR", 1e-12)  # shared by all pixels, for noise
     camera = cameras(mismatch)
     recording = bench(camera, levels)
     found = calibrate_step(recording, fresh=True)
@@ -65,6 +62,7 @@ def test_a_running_camera_starts_anywhere() -> None:
         assert np.sqrt((sigmas**2).mean()) < 1.4
 
 
+@pytest.mark.usefixtures("known_levels")
 def test_quantisation_shrinks_with_the_step() -> None:
     """One step: the error is that of a count of dlogI / theta, the std says so."""
     camera = cameras(0.03)
@@ -93,6 +91,7 @@ def test_noise_is_taken_off_and_measured() -> None:
         assert abs(seen - true) < 3.5 * np.sqrt(true / rest)
 
 
+@pytest.mark.usefixtures("known_levels")
 @pytest.mark.parametrize("stores", [True, False])
 @pytest.mark.parametrize("levels", [CYCLES, STAIRS], ids=["cycles", "stairs"])
 def test_noise_that_stores_the_light_is_told_from_noise_that_does_not(

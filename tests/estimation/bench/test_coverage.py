@@ -86,6 +86,7 @@ def test_a_step_that_lost_its_events_is_left_out(whole: Recording, step: int) ->
     assert f"(number {step + 1}): they sent far fewer events" in text
 
 
+@pytest.mark.usefixtures("known_levels")
 def test_silence_at_rest_is_not_observed(whole: Recording) -> None:
     """Noise of a rest of which the longer half is lost, and rates as of the whole recording."""
     at = int(EDGES[5])
@@ -123,6 +124,7 @@ def clipped(whole: Recording, gain: float, columns: int = 32, floor: float = 0.0
     return Recording(whole.events, np.rint(frames).astype(np.uint8), whole.frame_times)
 
 
+@pytest.mark.usefixtures("known_levels")
 @pytest.mark.parametrize("columns", [32, 10])
 def test_levels_that_saturated_frames_hide_are_not_used(whole: Recording, columns: int) -> None:
     """220 DN are shown as 255, not as 396: to the whole view, or to some pixels."""

@@ -47,6 +47,7 @@ def measured(dead_s: float, ramp: int) -> tuple[CameraEstimate, np.ndarray]:
         np.asarray(getattr(camera, name))) - 1.0 for name in ("theta_on", "theta_off")])
 
 
+@pytest.mark.usefixtures("known_levels")
 @pytest.mark.parametrize(("dead_s", "ramp"), [(1e-3, 20), (5e-4, 10), (5e-4, 20)])
 def test_contrast_lost_on_edges_is_told_and_in_the_errors(dead_s: float, ramp: int) -> None:
     found, away = measured(dead_s, ramp)
