@@ -26,7 +26,7 @@ from evflow.simulator import noise, pixel, second_order, sensor
 from evflow.simulator.constants import Constants
 from evflow.simulator.pixel import PixelState
 from evflow.simulator.sensor import Sensor
-from evflow.simulator.spikes import Spikes
+from evflow.simulator.spikes import TIE, Spikes
 
 Array = jax.Array
 T = TypeVar("T")
@@ -124,7 +124,7 @@ def look(
 def _beyond(camera: Camera, contrast: Array) -> Array:
     """Whether contrast may cross a threshold, up to rounding in `step`."""
     near = 1.0 - SLACK
-    return (contrast >= near * camera.theta_on) | (-contrast >= near * camera.theta_off)
+    return (contrast >= near * camera.theta_on - TIE) | (-contrast >= near * camera.theta_off - TIE)
 
 
 @jax.jit

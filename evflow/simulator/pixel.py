@@ -14,7 +14,6 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from evflow.camera import Camera
 from evflow.simulator import second_order
 from evflow.simulator.constants import Constants
 from evflow.simulator.spikes import Spikes, begun_anew, crossings, floor_divide, since_last
@@ -42,26 +41,6 @@ def never_fired(model: Constants) -> Array | float:
     if model.timestamps == "crossing":
         return 1e6
     return 0.0 if model.refractory_s is None else -model.refractory_s
-
-
-def exact(camera: Camera) -> Camera:
-    """Thresholds rounded to 16 significant bits, a change below 8e-6 of their value.
-
-    Sums of log intensity and thresholds are then exact in float32, and a contrast of k theta
-    crosses exactly k times. Such ties are common in 8-bit video, where pixels return to earlier
-    values. ESIM adds thresholds to its reference until it passes; v2e rounds, and loses one event
-    in 600.
-    """
-    def rounded(theta: Array) -> Array:
-        if theta.dtype != jnp.float32:
-            return theta
-        bits = jax.lax.bitcast_convert_type(theta, jnp.uint32)
-        even = (bits >> 8) & 1
-        return jax.lax.bitcast_convert_type(
-            (bits + even + jnp.uint32(0x7F)) & jnp.uint32(0xFFFFFF00), jnp.float32)
-
-    return dataclasses.replace(camera, theta_on=rounded(camera.theta_on),
-                               theta_off=rounded(camera.theta_off))
 
 
 def low_pass(model: Constants, lp: Array, log_i: Array, i01: Array, dt: Array) -> Array:

@@ -146,7 +146,6 @@ def start(
     k_leak, k_words, k_intervals = jax.random.split(key, 3)
     count = math.prod(log_frame.shape)
     flat = jax.tree.map(lambda m: m.reshape(count), camera)
-    flat = pixel.exact(flat) if model.kind == "esim" else flat
     base = (log_frame - (0.0 if phase is None else phase)).reshape(count)
     log_i = log_frame.reshape(count)
     reference = jnp.mean(i01_of(model, log_i))

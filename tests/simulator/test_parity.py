@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from evflow.camera import Camera
-from evflow.camera.sensors import SensorModel
+from evflow.camera.sensors import SENSORS, SensorModel
 from evflow.simulator import simulate
 from evflow.types import Events
 
@@ -39,7 +40,8 @@ BIG_CASES: dict[str, tuple[float, float, dict[str, Any]]] = {
 def run(frames: np.ndarray, times: np.ndarray, case: tuple, timestamps: str) -> Events:
     on, off, options = case
     model = SensorModel(timestamps=timestamps, **options)  # type: ignore[arg-type]
-    camera = Camera.constant(frames.shape[1:], on, off)
+    nothing = jnp.zeros(frames.shape[1:])
+    camera = Camera(on + nothing, off + nothing, nothing, nothing)
     return simulate(jax.random.key(0), frames, times, camera, model=model)
 
 
@@ -62,17 +64,33 @@ def test_counts_are_v2es(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["base", "asym", "theta05"])
 def test_crossing_times_move_no_event_to_another_frame(name: str) -> None:
-    """Without a refractory period the counts do not depend on how events are stamped."""
+    """Without a refractory period the counts do not depend on how events are stamped, where no
+    contrast is a multiple of a threshold."""
     with np.load(SMALL) as golden:
         frames, times = golden["frames"], golden["times_us"]
-        crossing = run(frames, times, CASES[name], "crossing")
-        compare(crossing, golden, name)
-    slots = run(frames, times, CASES[name], "v2e")
+        compare(run(frames, times, CASES[name], "crossing"), golden, name)
+    on, off, options = CASES[name]
+    spread = 1.0 + 0.03 * np.random.default_rng(0).standard_normal((2, *frames.shape[1:]))
+    maps = on * spread[0], off * spread[1]
+    crossing, slots = (run(frames, times, (*maps, options), stamps) for stamps in (
+        "crossing", "v2e"))
     np.testing.assert_array_equal(crossing.count_map(), slots.count_map())
     edges = times + 1  # events of a frame lie in (t_prev, t_now]
-    np.testing.assert_array_equal(np.histogram(crossing.t, edges)[0],
-                                  np.histogram(slots.t, edges)[0])
+    moved = np.histogram(crossing.t, edges)[0] - np.histogram(slots.t, edges)[0]
+    assert np.abs(moved).sum() <= 1e-4 * len(slots)  # those within 1e-6 of a threshold
     assert len(np.unique(crossing.t)) > 20 * len(np.unique(slots.t))
+
+
+@pytest.mark.parametrize("theta", [0.1, 0.2, 0.25, 0.35])
+@pytest.mark.parametrize("model", ["clean", "esim"])
+def test_a_pixel_that_returns_to_its_value_returns_all_its_events(theta: float, model: str) -> None:
+    """Twice as bright and back, ten times: a contrast of k thresholds crosses k times."""
+    dark = np.arange(21, 128)
+    frames = np.stack([dark] + [2 * dark, 2 * dark, dark, dark] * 10)[:, None].astype(np.uint8)
+    camera = Camera.constant(frames.shape[1:], theta, theta)
+    events = simulate(jax.random.key(0), frames, 1000 * np.arange(len(frames)), camera,
+                      model=SENSORS[model].model)
+    np.testing.assert_array_equal(events.count_map(), 10 * int(np.log(2.0) / theta))
 
 
 @pytest.mark.slow
