@@ -103,6 +103,8 @@ NOTES: dict[str, str] = {
     "pixels.unsure": "most pixels have no events of their own",
     "noise.assumed": "that noise falls with light is assumed",
     "noise.drift": "light that drifts causes events that are not counted as noise",
+    "noise.on": "most noise is ON, and leak was not separated",
+    "noise.unlit": "noise falls with light that no frames show",
     "noise.even": "the noise rate does not fall with intensity",
     "windows.beyond": "events come before the first frame or after the last",
     "windows.skipped": "windows between frames were left out",

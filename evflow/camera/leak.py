@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+MOST_SHOT = 20.0  # times the camera's shot noise: what exceeds it is a fault's, in any light
 STEPS = 8  # fixed-point iterations, each of which at least halves the error
 LEAST = 1e-4  # of a leak period that other events interrupt
 
@@ -18,10 +19,17 @@ def without_leak(eta_on: Any, eta_off: Any, leak_hz: Any, resets: bool = True) -
     xp = eta_on.__array_namespace__()
     left, leak_hz = eta_on, xp.maximum(xp.asarray(leak_hz, dtype=eta_on.dtype), 1e-12)
     for _ in range(STEPS):
-        waited = xp.maximum((left + eta_off) / leak_hz, LEAST)
-        seen = leak_hz * waited / xp.expm1(waited) if resets else leak_hz
+        seen = leak_among(leak_hz, left + eta_off) if resets else leak_hz
         left = xp.maximum(eta_on - seen, 0.0)
     return left
+
+
+def leak_among(leak_hz: Any, others_hz: Any) -> Any:
+    """ON events per second of a leak of `leak_hz` (> 0) among others (an array, Hz), which reset
+    the memory: of its periods, those in which none of them comes."""
+    xp = others_hz.__array_namespace__()
+    waited = xp.maximum(others_hz / leak_hz, LEAST)
+    return leak_hz * waited / xp.expm1(waited)
 
 
 def shot_eta(eta_on: float, eta_off: float, leak_hz: float) -> float:

@@ -43,6 +43,7 @@ FILES = ("camera.npz", "camera.json", "report.html", *(
 READ = ("effort", "budget_s", "on_interrupt")  # options on how much is read
 SHORT = 100 * 346 * 260  # pixels of frames: memory does not matter in recordings this short
 SAID_BELOW = ("EV011", "EV017", "EV030")  # findings that an estimate notes itself
+OF_EACH = ("events.gaps", "pixels.hot", "pixels.dead")  # notes on a recording, not on the camera
 
 
 @own_first
@@ -184,8 +185,10 @@ class Estimate(Compiling, Reading):
             progress(0, 1, "checking")
             report = check(recording, min_window_us=round(self.window_ms * 1000))
         print_notes(recording, beside=report)
-        # Between the steps of a light frames may be early or late by much of a rest.
-        spared = ("EV024",) if self.protocol == "step" else ()
+        # Between the steps of a light frames may be early or late by much of a rest; leak is ON.
+        spared = {"step": ("EV024",), "static": (
+            "EV022",) * (0 < int(recording.events.p.sum()) < len(recording.events))}.get(
+                self.protocol, ())
         if self.checks and (failed := [e for e in report.errors if e.code not in spared]):
             raise failed[0].error()
         stepping = bench_note(recording) if self.protocol == "motion" else None
@@ -268,7 +271,9 @@ class Estimate(Compiling, Reading):
 
         with naming(path):
             recording, _, doubts = self._recorded(path)
-            return estimate_noise(recording, lux=lux), [
+            found = estimate_noise(recording, lux=lux)
+            doubts = [*(note for note in found.notes if note.code in OF_EACH), *doubts]
+            return found, [
                 dataclasses.replace(doubt, text=f"{path}: {doubt.text}") for doubt in doubts]
 
     def _report(

@@ -72,7 +72,8 @@ def _measured(tables: Array) -> Leak:
     strange = _overdispersion(expected[:, best], on, off)
     none = _likelihood(np.zeros((1, len(on))), on, off)[0][0]
     total = special.logsumexp(likely / strange)
-    events = float(leaked[best].sum())
+    # Of the hazard of one period and spread, tails of the pixels' real ones would be left out.
+    events = float((on * leaked[best] / expected[0, best]).sum())
     if total - np.log(len(grid)) - none / strange < ODDS or events < LEAST_EVENTS:
         return Leak()
     weight, logs = np.exp(likely / strange - total), np.log([period for period, *_ in grid])

@@ -17,7 +17,7 @@ from scipy import special
 Array = np.ndarray
 
 SPREADS = np.geomspace(0.02, 2.0, 41)  # standard deviations of the rate, relative to its mean
-SPREAD, SPREAD_ERROR = 0.05, 0.6  # prior median of the spread, and std of its log
+SPREAD, SPREAD_ERROR = 0.1, 0.8  # prior median of the spread, and std of its log
 NEGLIGIBLE = 1e-4  # probability below which a spread is left out
 # Pixels that are noisier than the others without being hot: their share, and the shape and mean of
 # their rates relative to the camera's.

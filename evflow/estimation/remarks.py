@@ -155,6 +155,23 @@ ASSUMED = Note(
     "there is no shot noise, and simulations of other light have too much or too little noise.")
 
 
+UNLIT = Note(
+    "noise.unlit", "noise falls with light, as the recordings at other illuminances show, but no "
+    "frames show how bright the light on a pixel was: simulations have the first recording's noise "
+    "in any light. If the camera has frames, record with them.")
+UNEVEN, LEAST_ON = 3.0, 200  # times as many ON events as OFF ones, and how many
+
+
+def uneven_notes(counts: np.ndarray, leak_hz: float) -> list[Note]:
+    """A note where most noise (2, N) is ON, as by leak, that was not separated."""
+    on, off = counts.sum(1, dtype=np.float64)
+    if leak_hz or on < LEAST_ON or on < UNEVEN * off:
+        return []
+    return [Note("noise.on", f"{on / (on + off):.0%} of the noise is ON, as where pixels leak, but "
+                 "its intervals are not regular enough, or too few, to tell: leak is not separated "
+                 "from shot noise. Record for ten of its periods or more, at one temperature.")]
+
+
 def noise_notes(shot: Shot) -> list[Note]:
     if shot.even:
         return [EVEN_NOISE]

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from evflow.camera.leak import shot_eta
+from evflow.camera.leak import leak_among, shot_eta
 from evflow.camera.prior import Summary
 from evflow.camera.sensors import SensorModel
 from evflow.estimation.leak import Leak
@@ -23,6 +23,7 @@ Array = np.ndarray
 LIGHTS = 8  # bins of I01
 LEAST_EVENTS = 200.0
 ODDS = 3.0  # log odds required to decide whether noise depends on light
+LEAK_ERROR = 0.02  # relative, of leak events
 UNSURE = 0.25  # relative error of shot_hz if undecided
 
 
@@ -66,11 +67,14 @@ def measured_noise(
             {**std, "leak_hz": leak.std_hz, "shot_hz": shot.std_hz})
 
 
-def measured_shot(light: Array, leak_hz: float, scattered: float, error: float = 0.0) -> Shot:
+def measured_shot(
+    light: Array, leak_hz: float | Array, scattered: float, error: float = 0.0
+) -> Shot:
     """v2e's shot noise, from events by light (2, 3, LIGHTS). leak_hz: ON events from leak, at any
-    light; scattered: from `scatter`; error: relative, of the events, e.g. for residual signal among
-    them."""
+    light or (LIGHTS,); scattered: from `scatter`; error: relative, of the events, e.g. for residual
+    signal among them."""
     events, seconds, falling = np.moveaxis(light, 1, 0)
+    leaks = bool(np.any(leak_hz))
     leaked = np.stack([leak_hz * seconds[0], np.zeros(LIGHTS)])
     noise = np.maximum(events.sum(1) - leaked.sum(1), 0.0)
     if noise.sum() < LEAST_EVENTS:
@@ -78,7 +82,7 @@ def measured_shot(light: Array, leak_hz: float, scattered: float, error: float =
     odds = 0.0
     for side, (n, other, sent, shapes) in enumerate(zip(
             events, leaked, noise, zip(falling, seconds, strict=True), strict=True)):
-        if side == 0 and not leak_hz:
+        if side == 0 and not leaks:
             continue  # ON noise may contain leak, which does not depend on light
         likely = []
         for shape in shapes:
@@ -88,13 +92,25 @@ def measured_shot(light: Array, leak_hz: float, scattered: float, error: float =
     if odds < -ODDS:
         return Shot(even=True)
     halves = noise / np.maximum(falling.sum(1), 1e-9)
-    excess = 0.0 if leak_hz else max(float(halves[0] - halves[1]), 0.0)  # of ON: maybe leak
+    excess = 0.0 if leaks else max(float(halves[0] - halves[1]), 0.0)  # of ON: maybe leak
     hz = float(halves.sum()) - excess
     if hz <= 0.0:
         return Shot()
     relative = np.sqrt(scattered / noise.sum() + error**2 + (odds < ODDS) * UNSURE**2
-                       + (0.5 * excess / hz) ** 2)
+                       + (0.5 * excess / hz) ** 2 + (LEAK_ERROR * leaked.sum() / noise.sum()) ** 2)
     return Shot(hz, hz * float(relative), falls=odds > ODDS)
+
+
+def shot_beside_leak(light: Array, leak: Leak, scattered: float) -> Shot:
+    """`measured_shot` of a scene at rest, where leak shows less in the dark, as more noise resets
+    the memory there."""
+    shot = measured_shot(light, leak.rate_hz, scattered)
+    if not (leak.hz and shot.falls):
+        return shot
+    _, seconds, falling = light[0]
+    seen = leak_among(leak.hz, shot.hz * falling / np.maximum(seconds, 1e-9))
+    seen *= leak.rate_hz * seconds.sum() / (seen @ seconds)
+    return measured_shot(light, seen, scattered)
 
 
 def at_mean_light(

@@ -29,6 +29,9 @@ MOST_HOT_NEAR = 2  # hot pixels in a neighbourhood, including itself
 # Silent pixels side by side; those of a column beside them that fire, and their share: so many
 # silent ones come by chance with a probability of .5^40.
 LEAST_SILENT, LEAST_BUSY, MOSTLY = 40, 8, 0.5
+# Of a static scene: share of the pixels that fired, and the events that the quietest of them sent,
+# at a mean above 12.
+QUIETEST, LEAST_FIRED_AT_REST = 0.01, 6
 DEAD_EVENTS = 12  # median of the neighbourhood: chance e^-12, with room for a high threshold
 
 
@@ -110,6 +113,14 @@ def dead_pixels(n_events: np.ndarray) -> np.ndarray:
     without any beside ones whose pixels mostly fire; n_events (H, W)."""
     alone = (n_events == 0) & (_median_around(n_events) >= DEAD_EVENTS)
     return alone | silent_lines(n_events)
+
+
+def dead_at_rest(n_events: np.ndarray) -> np.ndarray:
+    """`dead_pixels` of a static scene, in which even the quietest pixels fire after long enough:
+    silent areas are dead too, if most pixels are not."""
+    fired = n_events[n_events > 0]
+    lowest = float(np.quantile(fired, QUIETEST)) if len(fired) > MOSTLY * n_events.size else 0.0
+    return dead_pixels(n_events) | ((n_events == 0) & (lowest >= LEAST_FIRED_AT_REST))
 
 
 def silent_lines(n_events: np.ndarray) -> np.ndarray:

@@ -14,17 +14,24 @@ Array = np.ndarray
 PACKET, QUARTERS = 64, 4  # events: the time they span gives the density of the recording
 SAMPLES = 1_000_000  # packets examined
 GAP_PACKETS, GAP_US = 10, 10_000  # a gap exceeds both
+# Packets of steady noise: a pause as long comes by chance with e^-38. And share of the time
+# that is busier, as where all pixels leak at once.
+AT_REST, BUSIER = 0.6, 0.9
+# Periods between gaps of a flickering light, their relative scatter; the longest one of a lamp, and
+# the share of the time that is silent between the bursts of slower ones.
+LEAST_PERIODS, EVEN, LAMP_US, SILENT = 4, 0.25, 50_000, 0.6
 SLOW = 0.3  # share of the time; a sensor may have lost the rest
 BLOCK = 1 << 22  # events examined at a time
 TICKS = 3.0  # and this many usual pauses between two times: some simulators use few times
 
 
-def event_gaps(t: Array) -> Array:
+def event_gaps(t: Array, packets: float = GAP_PACKETS, slow: float = SLOW) -> Array:
     """Indices i of the ascending times t (N,) int64 us such that events are missing between t[i]
-    and t[i + 1]; none if there are too few to decide."""
+    and t[i + 1]; none if there are too few to decide. packets: usual spans of a packet that a gap
+    exceeds; slow: as of `_usual_packet`."""
     if len(t) < 4 * PACKET:
         return np.zeros(0, np.int64)
-    long = max(GAP_PACKETS * _usual_packet(_packets(t)), GAP_US)
+    long = max(packets * _usual_packet(_packets(t), slow), GAP_US)
     longest = np.concatenate([first + np.flatnonzero(d > long) for first, d in _pauses(t)])
     if not len(longest):
         return longest
@@ -32,13 +39,28 @@ def event_gaps(t: Array) -> Array:
     return longest[t[longest + 1] - t[longest] > TICKS * usual]
 
 
-def stretches(events: Events) -> list[Events]:
-    """The events between the gaps; the events themselves if there is no gap."""
-    t, at = events.t, event_gaps(events.t)
-    if not len(at):
+def stretches_at_rest(events: Events, hot: Array) -> list[Events]:
+    """The events of a scene at rest between the gaps; the events themselves if there is none. Noise
+    is steady, so that shorter gaps show than among others, but not that of hot (H, W) pixels. Gaps
+    at the pace of a lamp are the pauses of a flickering light."""
+    steady = ~hot[events.y, events.x]
+    t = events.t[steady]
+    at = event_gaps(t, AT_REST, BUSIER)
+    # Where a hot pixel fires, packets arrive.
+    at = at[np.searchsorted(events.t, t[at + 1]) - np.searchsorted(events.t, t[at], "right") == 0]
+    if not len(at) or _as_a_lamp(t[at], float((t[at + 1] - t[at]).sum()) / events.duration_us):
         return [events]
-    begins, ends = [t[0], *t[at + 1]], [*t[at], t[-1]]
+    begins, ends = [events.t[0], *t[at + 1]], [*t[at], events.t[-1]]
     return [events.slice(int(a), int(b) + 1) for a, b in zip(begins, ends, strict=True)]
+
+
+def _as_a_lamp(t: Array, silent: float) -> bool:
+    """Whether gaps that begin at t (N,) us, and take this share of the time, come as those of a
+    flickering light: one period apart, which is short, or mostly silent."""
+    apart = np.diff(t)
+    if len(apart) < LEAST_PERIODS or np.std(apart) > EVEN * np.mean(apart):
+        return False
+    return bool(np.mean(apart) < LAMP_US or silent > SILENT)
 
 
 def joined(parts: list[Events]) -> Events:
@@ -65,14 +87,14 @@ def _packets(t: Array) -> Array:
     return np.concatenate(some)
 
 
-def _usual_packet(quarters: Array) -> float:
+def _usual_packet(quarters: Array, slow: float) -> float:
     """The median time span of packets; or, if that is longer, the one which packets exceed in all
-    but SLOW of the time: where most events come in bursts, as of steps of light, the time between
+    but `slow` of the time: where most events come in bursts, as of steps of light, the time between
     is no gap. A gap in a packet does not count there, as it is in one of its quarters."""
     even = np.sort(QUARTERS * np.median(quarters, 1))
     passed = np.cumsum(even)
-    slow = even[np.searchsorted(passed, SLOW * passed[-1])]
-    return max(float(np.median(quarters.sum(1))), float(slow))
+    slowest = even[np.searchsorted(passed, slow * passed[-1])]
+    return max(float(np.median(quarters.sum(1))), float(slowest))
 
 
 def _pauses(t: Array) -> Iterator[tuple[int, Array]]:

@@ -135,6 +135,9 @@ def _summary(found: CameraEstimate, grade: Grade, sentences: list[str]) -> Panel
     if found.sensor.leak_hz:
         rows.append(["leak, a part of the noise ON", spread(
             found.sensor.leak_hz, found.sensor_std["leak_hz"]) + " Hz per pixel", ""])
+    if found.sensor.shot_hz:
+        rows.append(["shot noise in the dark, ON and OFF", spread(
+            found.sensor.shot_hz, found.sensor_std["shot_hz"]) + " Hz per pixel", ""])
     if found.bench and found.bench.dead.measured:
         rows.append(["dead time", spread(1e3 * found.bench.dead.seconds,
                                          1e3 * found.bench.dead.std_s) + " ms", ""])

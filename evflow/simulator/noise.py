@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera import Camera
-from evflow.camera.leak import without_leak
+from evflow.camera.leak import MOST_SHOT, without_leak
 from evflow.errors import EvflowDataError
 from evflow.light.log_maps import Values, noise_factor
 from evflow.simulator.constants import Constants
@@ -162,7 +162,7 @@ def rates(model: Constants, camera: Camera, reference: Array, nominal: Array) ->
     reference: the I01 at which eta is given (the mean of the first frame). nominal: of
     `nominal_thresholds`; v2e's shot noise adds R/2 ((F-1) I01 + 1) nominal / theta. If eta includes
     all noise (`eta_is_all`), leak is subtracted, and the rest, normalised by `nominal`, is the
-    pattern of shot noise, unless there is none.
+    pattern of shot noise, unless there is none. Beyond `MOST_SHOT` it is a hot pixel's, steady.
     """
     eta = _but_leak(model, camera)
     if not model.eta_intensity and model.shot_hz is None:
@@ -174,9 +174,12 @@ def rates(model: Constants, camera: Camera, reference: Array, nominal: Array) ->
         steady, varying = varying, (eta[0] * gain, eta[1] * gain)
     if model.shot_hz is not None and model.eta_is_all:
         half, shot = 0.5 * model.shot_hz, model.shot_hz > 0  # a traced one may be 0
-        falling = (half * nominal[0] * eta[0], half * nominal[1] * eta[1])
+        hot = tuple(jnp.where(own * n > MOST_SHOT, own, 0.0)
+                    for own, n in zip(eta, nominal, strict=True))
+        falling = tuple(half * n * (own - steadily)
+                        for n, own, steadily in zip(nominal, eta, hot, strict=True))
         return Rates(*jax.tree.map(lambda with_it, none: jnp.where(shot, with_it, none),
-                                   ((zero, zero), falling), (steady, varying)))
+                                   (hot, falling), (steady, varying)))
     if model.shot_hz is not None:
         half = 0.5 * model.shot_hz
         varying = (varying[0] + half * (nominal[0] / camera.theta_on),

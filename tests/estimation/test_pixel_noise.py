@@ -11,6 +11,8 @@ from evflow.camera import Camera, Summary
 from evflow.estimation.maps import with_rates, with_unquiet_error
 from evflow.estimation.pixel_noise import (
     ODD,
+    SPREAD,
+    SPREAD_ERROR,
     _shapes,
     hot_rates,
     pixel_rates,
@@ -47,7 +49,7 @@ def test_equal_pixels_stay_equal() -> None:
     rates, events = drawn(0.0, np.full(SHAPE, 5.0))
     found, std = pixel_rates(events, np.full(SHAPE, 5.0), 0.4, NONE_HOT, error=0.0)
     assert np.abs(found / rates - 1.0).max() < 0.1
-    assert std.max() < 0.07 * 0.4
+    assert std.max() < 0.08 * 0.4
 
 
 def test_what_is_uncertain_of_the_camera_is_so_of_its_pixels_but_not_of_hot_ones() -> None:
@@ -111,7 +113,7 @@ def test_spreads_are_as_likely_as_the_negative_binomial_says() -> None:
     n = np.random.default_rng(3).poisson(expected * 1.2)
     shapes, weights = _shapes(n, expected)
     likely = np.array([stats.nbinom.logpmf(n, a, a / (a + expected)).sum() for a in shapes])
-    prior = -0.5 * (np.log(shapes**-0.5 / 0.05) / 0.6) ** 2
+    prior = -0.5 * (np.log(shapes**-0.5 / SPREAD) / SPREAD_ERROR) ** 2
     np.testing.assert_allclose(np.log(weights[1:] / weights[:-1]), np.diff(likely + prior),
                                rtol=1e-8, atol=1e-8)
 

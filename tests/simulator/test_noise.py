@@ -219,17 +219,20 @@ def test_eta_that_is_all_noise_follows_light_where_there_is_shot_noise() -> None
 
 
 def test_hot_pixels_and_crops_leave_the_measured_noise_of_others_alone() -> None:
-    """A rate is shot_hz / shot_eta_hz times the pixel's own eta, whatever its neighbours'."""
+    """A rate is shot_hz / shot_eta_hz times the pixel's own eta, whatever its neighbours'; a hot
+    pixel's its own, in any light."""
     model = Constants.of(SensorModel(shot_hz=2.0, shot_eta_hz=0.5, eta_is_all=True))
     eta = np.full((8, 8), 0.5, np.float32)
     eta[0, 0] = 50.0
 
-    def at(eta: np.ndarray) -> np.ndarray:
+    def at(eta: np.ndarray, i01: float = 0.0) -> np.ndarray:
         camera = Camera(*np.full((2, *eta.shape), 0.2, np.float32), eta, eta)
         seen = rates(model, camera, jnp.float32(0.5), nominal_thresholds(model, camera))
-        return np.asarray(sum(seen.at(jnp.float32(0.0))))
+        return np.asarray(sum(seen.at(jnp.float32(i01))))
 
-    np.testing.assert_allclose(at(eta), 2.0 * eta / 0.5, rtol=1e-6)
+    dark = np.where(eta == 50.0, 100.0, 2.0)
+    np.testing.assert_allclose(at(eta), dark, rtol=1e-6)
+    np.testing.assert_allclose(at(eta, 1.0), np.where(eta == 50.0, 100.0, 0.25 * dark), rtol=1e-6)
     np.testing.assert_array_equal(at(eta[:2]), at(eta)[:2])
 
 

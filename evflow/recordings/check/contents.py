@@ -46,7 +46,8 @@ def _one_polarity(counts: np.ndarray) -> list[Finding]:
     return [Finding(
         "EV022", "error", f"{share:.1%} of {on + off:,} events are {name}: polarity was probably "
         "lost in a conversion (-1 becomes True as bool, 255 as uint8).",
-        "Export it again with signed integers, or bool.")]
+        "Export it again with signed integers, or bool. (Leak in the dark is ON too: --protocol "
+        "static measures it.)")]
 
 
 def _few(counts: np.ndarray) -> list[Finding]:

@@ -265,8 +265,9 @@ def test_few_measured_pixels_are_told() -> None:
 def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The bench by the command line: a screen's steps, and what its noise sends at rest."""
     from evflow.cli import main
-
-    camera = Camera.constant(SHAPE, 0.2, 0.25, 1.0, 0.5)
+    even = Camera.constant(SHAPE, 0.2, 0.25, 1.0, 0.5)
+    by = 1.0 + 0.05 * np.random.default_rng(0).standard_normal(SHAPE).astype(np.float32)
+    camera = dataclasses.replace(even, theta_on=by * even.theta_on, theta_off=by * even.theta_off)
     source, still = tmp_path / "screen.npz", tmp_path / "still.npz"
     write_recording(source, bench(camera, CYCLES))
     dark = Recording(bench(camera, [100] * 20).events, np.zeros((0, *SHAPE), np.uint8), np.zeros(0))
