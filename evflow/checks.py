@@ -39,7 +39,7 @@ def plain(name: str, value: Any, unknown: str = "0") -> Any:
     except Exception as e:  # e.g. tensors on a GPU or with gradients; each library
         raise EvflowDataError(
             "EV003", f"{name} is a {type(value).__name__}, which cannot be made an array ({e}).",
-            "For a PyTorch tensor: tensor.detach().cpu().numpy().") from e
+            "For a PyTorch tensor: tensor.detach().cpu().float().numpy().") from e
     if array.dtype.kind in "mM":
         kind = {"m": "timedelta", "M": "datetime"}[array.dtype.kind]
         raise EvflowDataError(

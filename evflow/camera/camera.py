@@ -30,7 +30,7 @@ THETA_MIN = 0.01  # v2e clamps thresholds here; a pixel at the clamp is a hot pi
 
 
 @jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Camera:
     """An event camera, pixel by pixel: four float32 maps (..., H, W), a pytree for jit and grad.
 
@@ -147,7 +147,7 @@ class Camera:
         for name, draw, common in zip(PARAMETERS, draws, once, strict=True):
             value, error, part = getattr(camera, name), getattr(std, name), (shared or {}).get(name)
             if part:
-                error = jnp.sqrt(jnp.maximum(error**2 - (part * value) ** 2, 0.0))
+                error = jnp.sqrt(jnp.maximum(error**2 - (part * value) ** 2, 1e-30))
             pixels = value + error * draw
             pixels = pixels * jnp.exp(part * common) if part else pixels
             maps[name] = jnp.maximum(pixels, least.get(name, 0.0))

@@ -57,7 +57,7 @@ class Simulate(Pixels, Footage, Compiling):
     format: Format = "auto"
     """Format of the output, if its extension leaves a choice (event_utils in .h5)."""
     frames_too: bool = False
-    """Write the video's frames with the events: grey, at their own times."""
+    """Write the video's frames with the events: grey, linear in light, at their own times."""
     labels: bool = False
     """Write which events are noise (.h5: events/noise, .npz: noise): those from the camera's η and
     shot noise."""

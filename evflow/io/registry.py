@@ -175,17 +175,19 @@ def read_events(path: str | os.PathLike, **hints: Unpack[HintArguments]) -> Even
 def write_events(
     path: str | os.PathLike,
     events: Events | Recording,
-    format: str = "dsec",
+    format: str | None = None,
     *,
     overwrite: bool = False,
 ) -> None:
     """Write events, and the frames of a `Recording`, to a file; all or nothing.
 
     Args:
-        path: of the file, with an extension of the format.
+        path: of the file.
         events: events or, with frames, a recording.
         format: one of `WRITERS`: "dsec" (HDF5: events/{x, y, t, p}, ms_to_idx, t_offset), "npz",
-            "aedat4", "aedat2", "e2vid", "event_utils", "evreal".
+            "aedat4", "aedat2", "e2vid", "event_utils", "evreal"; None chooses by the path's
+            extension (.h5: "dsec", .npz: "npz", .aedat4: "aedat4", .aedat: "aedat2", .zip and .txt:
+            "e2vid", none: "evreal").
         overwrite: replace a file that exists.
 
     Raises:
@@ -211,9 +213,7 @@ def write_recording(
     Args:
         path: of the file; of a folder if it has no extension.
         recording: events and frames.
-        format: as in `write_events`; None chooses by the path's extension (.h5: "dsec",
-            .npz: "npz", .aedat4: "aedat4", .aedat: "aedat2", .zip and .txt: "e2vid", none:
-            "evreal").
+        format: as in `write_events`.
         overwrite: replace what exists.
 
     Raises:

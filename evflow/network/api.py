@@ -48,7 +48,7 @@ from evflow.network.coordinates import (
     unsquash_summary,
 )
 from evflow.network.inputs import check_finite, given_summary, prepare, same_precision
-from evflow.network.pooling import Stats
+from evflow.network.pooling import Stats, of_pixels
 from evflow.network.posterior import of_window
 from evflow.network.summary import finish, pooled_y, summarize
 
@@ -127,7 +127,7 @@ def encode(
     voxels, dlogI, window_s, intensity = prepare(config, voxels, dlogI, window_s, intensity)
     y, _ = _known_summary(params, config, voxels, dlogI, window_s, intensity, summary)
     context = pixel_context(window_s, intensity, dlogI.shape)
-    changes = _encode(net, voxels, dlogI, context, y, config=config)
+    changes = _encode(net, voxels, dlogI, of_pixels(context), y, config=config)
     return Code(changes, squash_summary(y), context)
 
 
@@ -240,5 +240,5 @@ def _answer(
     voxels, dlogI, window_s, intensity = prepare(config, voxels, dlogI, window_s, intensity)
     y6, y6_std = _known_summary(params, config, voxels, dlogI, window_s, intensity, summary)
     own = dlogI.shape if intensity is not None else (*dlogI.shape[:-2], 1, 1)
-    context = pixel_context(window_s, intensity, own)
+    context = of_pixels(pixel_context(window_s, intensity, own))
     return *inference.estimate(config, net, voxels, dlogI, context, y6), y6, y6_std

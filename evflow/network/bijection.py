@@ -43,7 +43,7 @@ DEFAULT_WINDOW_S = 0.05
 
 
 @jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Code:
     """The condition of the flow: what the bijection between events and (y, z) holds fixed.
 
@@ -159,7 +159,7 @@ def seen_code(code: Code, sensor: SensorModel | None, optics: Optics | None) -> 
 
 def _flow_condition(config: ModelConfig, code: Code) -> tuple[Array, Array]:
     y = architecture.over_pixels(unsquash_summary(code.summary), code.context.shape[:-1])
-    u = architecture.condition(config, code.changes, code.context, y)
+    u = architecture.condition(config, code.changes, pooling.of_pixels(code.context), y)
     return u, architecture.centre(config, y)
 
 
@@ -233,10 +233,10 @@ def generate(
 
     The code's summary is replaced by the camera's. The camera is assumed to have been running: its
     pixels' memories lie anywhere between the thresholds, whereas a simulation that starts at the
-    window's first frame gives about a tenth fewer events (a fifth for high thresholds). Where
-    nothing moves there is too much noise: in 50 ms .1 events of a pixel and polarity for .005 at
-    .1 Hz, .3 for .05 at 1 Hz. Values are not clipped: noise of the latents leaves small negative
-    weights.
+    window's first frame gives some 5 % fewer events (15 % for high thresholds). Noise follows eta
+    up to the 2 Hz of the training, and hardly rises above: where nothing moves, a pixel and
+    polarity has .04 events in 50 ms at 1 Hz (.05 expected), .09 at 5 Hz (.25). Values are not
+    clipped: noise of the latents leaves small negative weights.
 
     Args:
         params: of `load_weights`.

@@ -49,12 +49,14 @@ def squash(y: Array, output: Output = "log") -> Camera:
 
 
 def unsquash(camera: Camera, output: Output = "log") -> Array:
-    """Camera of maps (...) -> y (..., 4); eta below 1e-3 Hz is taken as 1e-3 Hz."""
+    """Camera of maps (...) -> y (..., 4); eta below 1e-3 Hz is taken as 1e-3 Hz, one below 0 is
+    NaN."""
     camera = real_maps(camera)
     if output == "tanh":
         values = jnp.stack([camera.theta_on, camera.theta_off, camera.eta_on, camera.eta_off], -1)
         return jnp.arctanh(jnp.clip(values, -TANH_EDGE, TANH_EDGE))
-    eta = [jnp.maximum(e, ETA_FLOOR) for e in (camera.eta_on, camera.eta_off)]
+    eta = [jnp.where(e < 0, jnp.nan, jnp.maximum(e, ETA_FLOOR))
+           for e in (camera.eta_on, camera.eta_off)]
     values = jnp.stack([camera.theta_on, camera.theta_off, *eta], -1)
     return (jnp.log(values) - per_channel(CENTRE, values)) / per_channel(SCALE, values)
 

@@ -33,7 +33,7 @@ SIGNAL_UNIT, EXPOSURE_UNIT = 1000.0, 100.0  # units of the std: pixels with even
 
 
 @jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Stats:
     """Additive statistics of one camera, float32: `a + b` is that of both. A pytree.
 
@@ -87,6 +87,12 @@ def given_features(context: Array) -> tuple[Array, Array]:
     """Window length in seconds and log intensity (...,) from `window_features`; an intensity that
     was not given is the centre."""
     return WINDOW_S * jnp.exp(context[..., 0]), context[..., 1] + MIDDLE
+
+
+def of_pixels(context: Array) -> Array:
+    """The context for encoder, flow and spread, which are trained with the intensity: one that was
+    not given is the centre. The pooling network is trained without, too."""
+    return context.at[..., 2].set(1.0)
 
 
 def pixel_features(voxels: Array, dlogI: Array, context: Array) -> Array:

@@ -69,11 +69,19 @@ def _times(numbers: dict[str, Any]) -> list[Judged]:
     if real is None or made is None:  # no events to say it of
         return judged
     gap = abs(real - made)
+    # A thinner stream has fewer neighbours, without any noise.
+    advice = ("Judge them again once the rates agree." if _rates_off(numbers) else
+              f"{'Raise' if real > made else 'Lower'} the noise rates of the simulation, if any.")
     judged.append(Judged(
-        graded(gap, (0.1, 0.3)), "", gap / 0.1, f"Isolated events, mostly noise: {real:.0%} "
-        f"recorded, {made:.0%} synthetic.", advice="" if gap <= 0.1 else
-        f"{'Raise' if real > made else 'Lower'} the noise rates of the simulation."))
+        graded(gap, (0.1, 0.3)), "", gap / 0.1, "Isolated events, of noise or sparse signal: "
+        f"{real:.0%} recorded, {made:.0%} synthetic.", advice=advice if gap > 0.1 else ""))
     return judged
+
+
+def _rates_off(numbers: dict[str, Any]) -> list[float]:
+    """Ratios of the rates, synthetic to real, of the polarities in which they differ."""
+    ratios = [numbers["rate_hz"]["ratio"][side] for side in ("on", "off")]
+    return [ratio for ratio in ratios if ratio and max(ratio, 1.0 / ratio) > RATE[0]]
 
 
 def _timing(numbers: dict[str, Any], kinds: list[str]) -> str:
@@ -85,8 +93,7 @@ def _timing(numbers: dict[str, Any], kinds: list[str]) -> str:
     seen = ", ".join(
         f"{TIMES[kind][1]} {1e3 * median['synthetic']:.2f} against {1e3 * median['real']:.2f} ms"
         for kind, median in medians.items())
-    ratios = [numbers["rate_hz"]["ratio"][side] for side in ("on", "off")]
-    off = [ratio for ratio in ratios if ratio and max(ratio, 1.0 / ratio) > RATE[0]]
+    off = _rates_off(numbers)
     fewer = {ratio < 1 for ratio in off}
     if len(fewer) > 1:
         return (f"Synthetic events follow each other {how} (medians: {seen}): judge times again "

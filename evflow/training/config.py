@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Iterable
 from typing import Any, Literal
 
 from evflow.camera import CameraPrior
@@ -16,9 +17,17 @@ from evflow.camera.sensors import SensorModel
 from evflow.errors import EvflowDataError
 from evflow.network.config import PAPER_MODEL, ModelConfig
 from evflow.network.flow.config import FlowConfig
+from evflow.network.inputs import LONGEST_WINDOW_S
 from evflow.scenes.config import SceneConfig
 
 PARTS = ("summary", "encoder", "flow", "spread")
+
+
+def _check(kind: str, rules: Iterable[tuple[str, Any, bool, str]]) -> None:
+    """Raise EV020 at the first (name, value, whether it is good, what it must be) that is not."""
+    for name, value, good, rule in rules:
+        if not good:
+            raise EvflowDataError("EV020", f"{kind}: {name} {value!r}.", f"It must be {rule}.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,6 +73,17 @@ class LossConfig:
     edges: Literal["change", "gradient"] = "change"
     elu: bool = False
 
+    def __post_init__(self) -> None:
+        weights = {field.name for field in dataclasses.fields(self) if field.type == "float"}
+        _check("LossConfig", (
+            *((name, getattr(self, name), 0 <= getattr(self, name) < math.inf,
+               "0 or more, and finite") for name in sorted(weights - {"edge"})),
+            ("edge", self.edge, 0 < self.edge < math.inf, "above 0, and finite"),
+            ("events", self.events, self.events in ("rate", "edges"), '"rate" or "edges"'),
+            ("edges", self.edges, self.edges in ("change", "gradient"), '"change" or "gradient"'),
+            ("patches", self.patches, bool(self.patches) and min(self.patches) > 0,
+             "one or more sides in pixels")))
+
 
 @dataclasses.dataclass(frozen=True)
 class NuisanceConfig:
@@ -90,6 +110,16 @@ class NuisanceConfig:
     exposure_s: float = 0.01
     exposures: int = 4
     frame_noise_dn: float = 0.5
+
+    def __post_init__(self) -> None:
+        _check("NuisanceConfig", (
+            *((name, getattr(self, name), 0 <= getattr(self, name) <= 1, "a share, 0 to 1")
+              for name in ("fresh", "odd_pixels", "hot_pixels")),
+            *((name, getattr(self, name), 0 <= getattr(self, name) < math.inf,
+               "0 or more, and finite") for name in ("jitter_s", "exposure_s", "frame_noise_dn")),
+            *((name, (low, high), 0 < low <= high < math.inf, "a range above 0")
+              for name in ("odd_factor", "hot_hz") for low, high in [getattr(self, name)]),
+            ("exposures", self.exposures, self.exposures > 0, "at least 1")))
 
     @property
     def sharp(self) -> bool:
@@ -172,7 +202,7 @@ class TrainConfig:
         models, changes = len(self.sensors), self.model.changes
         group, patch = max(1, min(self.cameras, models)), max(self.loss.patches, default=1)
         step = self.scenes * self.cameras
-        for name, value, good, rule in (
+        _check("TrainConfig", (
             ("parts", self.parts, bool(self.parts) and set(self.parts) <= set(PARTS),
              f"some of {PARTS}"),
             ("steps", self.steps, self.steps > 0, "at least 1"),
@@ -191,8 +221,10 @@ class TrainConfig:
              self.steps_per_window > 0 and self.steps_per_window % changes == 0,
              f"a multiple of the model's {changes} changes"),
             ("windows", self.windows, self.windows > 0, "at least 1"),
-            ("window_s", self.window_s, 0 < self.window_s[0] <= self.window_s[1] < math.inf,
-             "a shortest and a longest length, above 0"),
+            ("window_s", self.window_s,
+             0 < self.window_s[0] <= self.window_s[1] <= LONGEST_WINDOW_S,
+             f"a shortest and a longest length in seconds, up to {LONGEST_WINDOW_S:g}"),
+            ("warmup", self.warmup, self.warmup >= 0, "0 or more"),
             ("textures", self.textures, self.textures > 0, "at least 1"),
             ("ema", self.ema, 0 <= self.ema < 1, "from 0 to below 1"),
             ("clip", self.clip, self.clip > 0, "above 0; math.inf clips nothing"),
@@ -202,11 +234,7 @@ class TrainConfig:
                     "learning_rate", "summary_rate", "flow_rate", "summary_noise"))),
             *((f"model.{name}", value, value > 0, "at least 1") for name, value in (
                 ("encoder_hidden", self.model.encoder_hidden),
-                ("summary_hidden", self.model.summary_hidden))),
-        ):
-            if not good:
-                raise EvflowDataError("EV020", f"TrainConfig: {name} {value!r}.",
-                                      f"It must be {rule}.")
+                ("summary_hidden", self.model.summary_hidden)))))
 
 
 # The paper's network and losses, where one core can train them in an hour.
