@@ -59,7 +59,11 @@ def config_of(params: Params) -> ModelConfig:
 
 
 def _sized(base: ModelConfig, net: Params) -> ModelConfig:
-    """The structure with the sizes taken from the leaves."""
+    """The structure with the sizes taken from the leaves. EV018 if these have one axis more."""
+    if (axes := net["encoder"]["Dense_0"]["kernel"].ndim) != 2:
+        raise EvflowDataError(
+            "EV018", f"params have {axes - 2} leading axes, as of several networks.",
+            "Use jax.vmap over them: jax.vmap(estimate, (0, None, None))(params, voxels, dlogI).")
     steps = net["flow"]["level_0"]["actnorm"]["raw"].shape[0]
     hidden = net["flow"]["level_0"]["coupling"]["w_2"].shape[-1]
     return dataclasses.replace(

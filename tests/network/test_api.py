@@ -239,6 +239,12 @@ def test_log_prob_is_finite_and_per_pixel(shipped: dict[str, Any]) -> None:
     assert np.isfinite(score).all()
 
 
+def test_negative_noise_is_nan_where_nothing_can_raise() -> None:
+    rates = jnp.array([-0.1, 0.0, 0.5])
+    y = jax.jit(lambda eta: unsquash(Camera(0.2 + 0 * eta, 0.2 + 0 * eta, eta, eta)))(rates)
+    np.testing.assert_array_equal(np.isnan(y[:, 2:]).any(1), [True, False, False])
+
+
 def test_squash_and_unsquash_are_inverse() -> None:
     y = jax.random.normal(jax.random.key(0), (5, 6, 4))
     np.testing.assert_allclose(unsquash(squash(y)), y, atol=1e-5)
@@ -282,6 +288,7 @@ def without_summary(params: Any) -> Any:
     ("EV020", lambda p, v, d: api.estimate(p, v, d, window_s=0.0)),
     ("EV018", lambda p, v, d: api.estimate({"other": {}}, v, d)),
     ("EV018", lambda p, v, d: api.estimate({"default": {}}, v, d)),
+    ("EV018", lambda p, v, d: api.estimate(jax.tree.map(lambda a: jnp.stack([a, a]), p), v, d)),
     ("EV018", lambda p, v, d: api.finish(without_summary(p), api.summarize(p, v, d))),
     ("EV020", lambda p, v, d: api.finish(p, sum(api.summarize(p, v, d) for _ in ()))),
     ("EV002", lambda p, v, d: api.estimate(p, v, d, window_s=np.full(3, 0.05))),
