@@ -256,7 +256,7 @@ def check_rate(rate_hz: float, dt_s: float) -> None:
         raise EvflowDataError(
             "EV014", f"noise reaches {rate_hz:.3g} Hz: {rate_hz * dt_s:.3g} events per pixel in "
             f"one frame interval of {dt_s * 1e3:.3g} ms.",
-            "Rates (eta, shot_hz) are in Hz per pixel, typically .01-10; hundreds are a hot pixel's: "
+            "Rates (eta, shot_hz) are in Hz per pixel, typically .01-10, a hot pixel's hundreds: "
             "shorten the interval (more frames per second), or lower its rate in the camera.")
 
 
