@@ -60,15 +60,14 @@ def main(options: Options) -> None:
             raise EvflowDataError("EV018", f"{', '.join(options.pixels)} are networks of several "
                                   "sizes.", "Average weights of one.")
         net = net | jax.tree.map(lambda *leaves: np.mean(leaves, 0), *given)
-        last = model_card(options.pixels[-1])
-        others = [model_card(w) for w in options.pixels[:-1]]
+        *others, last = (part_card(w, "pixels") for w in options.pixels)
         card = card | {"pixels": last | ({"mean_with": others} if others else {})}
         card.pop("calibration", None)  # of the pixels before
     if options.summary is not None:
         net = {part: v for part, v in net.items() if part not in AFTER_SUMMARY}
         net |= {"summary": taken(options.summary, name, "summary")["summary"]}
         card = {part: v for part, v in card.items() if part not in AFTER_SUMMARY}
-        card |= {"summary": model_card(options.summary)}
+        card |= {"summary": part_card(options.summary, "summary")}
     save_weights(options.out, {name: net}, card, overwrite=options.overwrite)
 
 
@@ -85,6 +84,12 @@ def cards(weights: str) -> dict[str, Any]:
     """The card of `weights` by parts; a single run's is that of the pixels' parts."""
     card = model_card(weights)
     return card if "pixels" in card else {"pixels": card}
+
+
+def part_card(weights: str, part: str) -> dict[str, Any]:
+    """The card of a part of `weights`; a single run's is that of all its parts."""
+    card = model_card(weights)
+    return card.get(part, card)
 
 
 if __name__ == "__main__":

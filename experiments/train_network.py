@@ -70,10 +70,11 @@ def main(options: Options) -> dict[str, Any]:
     camera = None if options.camera is None else Camera.load(options.camera)
     loss_weights = None if options.lpips is None else load_lpips(
         path=None if options.lpips == "auto" else options.lpips)
+    start = start_params(options.start, config)
     bank, sample = source(options.recordings, learning)
     tx = optimiser(learning)
     step = jax.jit(make_step(network, learning, tx, sample))
-    fresh = init_state(network, learning, tx, start_params(options.start, config))
+    fresh = init_state(network, learning, tx, start)
     state = train(lambda: (lambda state: step(state, bank, camera, loss_weights), fresh),
                   config, options).completed()
     figures = measure(network, state.params, learning, camera, options.batches)

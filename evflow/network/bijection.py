@@ -172,8 +172,9 @@ def forward(params: Params, voxels: ArrayLike, code: Code) -> tuple[Array, Array
         code: of `encode` or `code_from_video`, for the same pixels.
 
     Returns:
-        y (..., H, W, 4), `squash(y)` is the camera; z (..., H, W, 28), the latents; log_det
-        (..., H, W), the log determinant of d(y, z) / d voxels.
+        y (..., H, W, 4), `squash(y)` is the camera (`squash(y, "tanh")` of the paper's network); z
+        (..., H, W, 28), the latents; log_det (..., H, W), the log determinant of
+        d(y, z) / d voxels.
 
     Raises:
         EvflowDataError: EV002 (voxels and code of different pixels), EV003 (not real numbers),

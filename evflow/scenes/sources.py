@@ -192,5 +192,5 @@ def _some(key: Array | None, count: int, limit: int | None) -> list[int]:
 
 def own_bank(key: Array, images: str | os.PathLike) -> TextureBank:
     """A bank of one's own images: a folder of pictures, or a COCO json of objects."""
-    make = coco_bank if os.fspath(images).endswith(".json") else folder_bank
+    make = coco_bank if os.fspath(images).lower().endswith(".json") else folder_bank
     return make(key, images)

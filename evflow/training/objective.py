@@ -9,7 +9,13 @@ import jax
 import jax.numpy as jnp
 
 from evflow.network import architecture, encoder, flow, pooling
-from evflow.network.coordinates import squash, squash_summary, unsquash, unsquash_summary
+from evflow.network.coordinates import (
+    Output,
+    squash,
+    squash_summary,
+    unsquash,
+    unsquash_summary,
+)
 from evflow.network.pooling import Stats
 from evflow.process.devices import by_shard
 from evflow.training import losses
@@ -160,37 +166,40 @@ def _flow_losses(
         generated = jnp.arcsinh(generated)
     # Events are generated from the true changes. Those of the encoder contain a pixel's excess of
     # events, so that the flow would learn to use its thresholds less.
-    share = jnp.where(even[:, 0], 2.0, 0.0) if c.code == "changes" else jnp.ones(())
+    share = (even[:, 0] / jnp.mean(even, dtype=block.y.dtype) if c.code == "changes"
+             else jnp.ones(()))
     parts = {
         "parameter": _parameter_loss(y, block, config),
         "flow": losses.flow_loss(
             architecture.log_normal(y, y6[..., :4], architecture.base_std(y6)).sum(-1) if c.pool
             else jnp.zeros(log_det.shape),
             architecture.log_normal(z, 0.0, jnp.ones(())).sum(-1), log_det).mean(),
-        "event": (share * _event_loss(generated, block, config.loss)).mean(),
+        "event": (share * _event_loss(generated, block, config)).mean(),
         "inverse_flow": losses.inverse_flow_loss(inverse_det).mean(),
     }
     if c.spread:
         spread = architecture.spread(net, block.voxels, block.dlogI, block.context, u)
         nll = losses.gaussian_nll(jax.lax.stop_gradient(y) - block.y, spread).mean((1, 2, 3))
-        parts["spread"] = jnp.where(even[:, 0], 0.0, 2.0 * nll).mean()
+        odd = jnp.maximum(jnp.mean(~even, dtype=nll.dtype), 1e-6)  # 0 of a single scene
+        parts["spread"] = jnp.where(even[:, 0], 0.0, nll / odd).mean()
     return parts, {"pixel/y": jnp.abs(y - block.y).mean(), "max_z": jnp.abs(z).max()}
 
 
-def _event_loss(generated: Array, block: Block, config: LossConfig) -> Array:
+def _event_loss(generated: Array, block: Block, config: TrainConfig) -> Array:
     """L_E of each block, (B,)."""
-    expected = _expected(block)
-    if config.events == "rate":
-        return losses.rate_loss(generated, block.voxels, expected, config.patches)
+    expected, loss = _expected(block, config.model.output), config.loss
+    if loss.events == "rate":
+        return losses.rate_loss(generated, block.voxels, expected, loss.patches)
     # Mean log intensity of the two frames, about the middle.
-    strength = (block.changes.sum(-1) if config.edges == "change"
+    strength = (block.changes.sum(-1) if loss.edges == "change"
                 else losses.gradient(block.context[..., 1]))
-    return losses.event_loss(generated, block.voxels, strength, expected, config)
+    return losses.event_loss(generated, block.voxels, strength, expected, loss)
 
 
-def _expected(block: Block) -> Array:
-    """Expected events per bin, (B, h, w, 2m): a pixel's changes over its thresholds, plus noise."""
-    camera = squash(block.y)
+def _expected(block: Block, output: Output) -> Array:
+    """Expected events per bin, (B, h, w, 2m): a pixel's changes over its thresholds, plus noise.
+    output: of the network, whose coordinates block.y are."""
+    camera = squash(block.y, output)
     up, down = jnp.split(encoder.split_sign(block.changes), 2, -1)
     bins = block.changes.shape[-1]
     bin_s = pooling.WINDOW_S * jnp.exp(block.context[..., 0]) / bins

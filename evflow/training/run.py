@@ -107,8 +107,12 @@ def configuration(options: TrainOptions, devices: int) -> TrainConfig:
     config = dataclasses.replace(
         preset(options.preset), **{k: v for k, v in changes.items() if v is not None})
     network_name(config.model)
-    if config.scenes < 1:
-        raise EvflowDataError("EV020", f"scenes={config.scenes}.", "A step takes one or more.")
+    both = config.model.code == "changes" and not {"flow", "spread"}.isdisjoint(config.parts)
+    least = 2 if both else 1
+    if config.scenes < least:
+        raise EvflowDataError(
+            "EV020", f"scenes={config.scenes}.", f"A step takes {least} or more" + (
+                ": one of true changes, one of predicted ones." if both else "."))
     if config.scenes % devices:
         raise EvflowDataError(
             "EV020", f"{config.scenes} scenes a step do not divide among {devices} devices.",

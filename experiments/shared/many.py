@@ -39,10 +39,11 @@ def prepare(setup: Setup) -> None:
     """Load the weights and make the textures, once a process."""
     if _SHARED.get("setup") == setup:
         return
+    params = load_weights(setup.weights)  # the name may be wrong, and textures take seconds
     k_bank, k_data = jax.random.split(jax.random.key(setup.seed))
     bank = (own_bank(k_bank, setup.images) if setup.images is not None
             else make_bank(k_bank, PRESETS["default"].textures, photos=setup.photos))
-    _SHARED.update(setup=setup, params=load_weights(setup.weights), bank=bank, key=k_data)
+    _SHARED.update(setup=setup, params=params, bank=bank, key=k_data)
 
 
 def one(score: Score[Result], job: tuple[int, Protocol]) -> Result:
