@@ -165,6 +165,7 @@ class Reading:
         if self.exposure_ms is not None:
             recording = adjust.exposed(recording, self.exposure_ms)
         recording = adjust.linearised(recording, self.response)
+        recording = recording if self.colour == "luma" else adjust.balanced(recording)
         return _aligned(recording) if self.frames_offset_ms == "auto" else recording
 
 

@@ -150,7 +150,8 @@ def estimate(
         camera, error, summary, std, (state.n_shown >= VALID_EVENTS) & ~hot, n_events, hot, dead,
         state.windows,
         (*before, *camera_notes(stats, lacking, alone, n_events, summary, hot, dead, by_drift),
-         *receptor_notes(front_end.found, refined.optics, summary, std),
+         *receptor_notes(
+             front_end.found, refined.optics, summary, std, sought=front_end.sought),
          *exposure_notes(front_end.exposure), *lost_notes(lost, as_sent, summary),
          *noise_notes(shot),
          *drift_notes(quiet.drift, by_drift), *after, *extent.notes(), *drift.notes(thirds)),

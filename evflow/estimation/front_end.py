@@ -28,7 +28,8 @@ class FrontEnd:
     and their exposure, 0 if it is unknown; found: the search for the photoreceptor, None if there
     was none; dead: the dead time; lost: the contrast that pixels lose in it, None if they send it
     all; faulty: (H, W) bool, pixels that fire alone or never, None if there are none; films: of
-    stretches that are still to be read; exposure: of the frames, if it was measured."""
+    stretches that are still to be read; exposure: of the frames, if it was measured; sought:
+    whether a photoreceptor was looked for."""
 
     seen_by: Photoreceptor = IDEAL
     noise_dn: float = 0.0
@@ -39,6 +40,7 @@ class FrontEnd:
     faulty: np.ndarray | None = None
     films: Films = dataclasses.field(default_factory=dict)
     exposure: Exposure = UNSEEN
+    sought: bool = False
 
     @property
     def law(self) -> DeadContrast:
@@ -76,7 +78,7 @@ def find_front_end(
     blur_s = 1e-6 * float(np.mean([recording.exposure_us for recording, _ in runs]))
     seen_by = found.used if found else IDEAL
     return FrontEnd(seen_by, noise_dn, blur_s, found, settled(dead, lost), lost, faulty, films,
-                    exposure)
+                    exposure, sought=measured)
 
 
 def settled(dead: DeadTime, lost: Lost | None) -> DeadTime:

@@ -19,6 +19,13 @@ OPEN = 0.5  # of the stated error of theta: a log map that is told to be open is
 UNDETERMINED = 2.0  # times the stated error of theta: what the light alone may change is told
 FEW_EVENTS = 200  # of a polarity: with fewer its threshold is called uncertain
 
+LATE_S = 2.5e-3  # three standard deviations of frame times, a priori
+
+UNMEASURED = Note(
+    "pixels.open", "whether pixels are slow, and see other light than the frames show, was not "
+    "measured: too little happens, or too much between two frames. They are taken for ideal: slow "
+    "ones have lower thresholds than these. A longer recording, with slower motion or more frames "
+    "per second, tells.")
 LOGARITHMIC = Note(
     "pixels.log", "the pixels' response is logarithmic in dim light too, as ESIM's (log_eps), not "
     "linear below 20 DN as v2e's (linlog): the thresholds are of that.")
@@ -76,12 +83,21 @@ def _faulty(name: str, mask: np.ndarray, what: str) -> list[Note]:
 
 
 def receptor_notes(
-    found: Found | None, optics: Optics | None, summary: Summary, std: Summary
+    found: Found | None, optics: Optics | None, summary: Summary, std: Summary, *, sought: bool
 ) -> list[Note]:
+    """sought: whether a photoreceptor was looked for."""
     if found is None or optics is None:
-        return []
+        return [UNMEASURED] if sought else []
     notes = [Note("pixels.fast", "the photoreceptor is too fast for its cutoff to be measured: it "
-                  f"is above {found.least_cutoff_hz:.0f} Hz at 255 DN.")]
+                  f"is above {found.least_cutoff_hz:.0f} Hz at 255 DN, if it is proportional to "
+                  "light.")]
+    if abs(optics.delay_s) > LATE_S:
+        late = "after" if optics.delay_s > 0 else "before"
+        notes.append(Note(
+            "frames.delay", f"events come {1e3 * abs(optics.delay_s):.1f} ms {late} frames that "
+            "show the same (up to 4 ms are looked for): frame times are probably wrong, as those "
+            "of the exposure's begin or end, or of another clock. If so the cutoff is, and noise "
+            "rates and maps may be, too; thresholds suffer least. Pass --frames-offset-ms."))
     if found.sensor[0].cutoff_hz:
         notes = [Note("pixels.slow", "the thresholds refer to light filtered by the "
                       "photoreceptor's low-pass"

@@ -17,8 +17,9 @@ from evflow.io.images.exposures import given_exposure, noted
 from evflow.io.images.repeats import REPEATED
 from evflow.io.source import open_frames
 from evflow.light import response as light
-from evflow.light.colour import are_luma, as_seen, mosaic_luma, mosaic_note
+from evflow.light.colour import CELLS, are_luma, as_seen, mosaic_luma, mosaic_note
 from evflow.notes import Note
+from evflow.recordings.mosaics import LEAST_DN, UNEVEN, planes
 from evflow.types import Recording
 
 MARGIN_US = 1_000_000  # frames this far outside the events are kept: their clock may be off
@@ -60,6 +61,26 @@ def demosaiced(recording: Recording, pattern: str) -> Recording:
     for i, frame in enumerate(recording.frames):
         frames[i] = mosaic_luma(frame, pattern)
     return _changed(recording, mosaic_note(pattern), frames=frames)
+
+
+def balanced(recording: Recording) -> Recording:
+    """The recording whose frames are a colour mosaic, with its four planes scaled to the median of
+    the brightest: motion is followed across them, and what neighbours see is alike. A scale of
+    light that stays the same changes no contrast. Frames of one brightness stay as they are."""
+    medians = planes(recording)
+    if medians.min() < LEAST_DN or medians.max() < UNEVEN * medians.min():
+        return recording
+    gains = medians.max() / medians
+    frames = np.empty(recording.frames.shape, np.float32)
+    for i in range(len(frames)):
+        frames[i] = recording.frame_dn(i)
+        for cell, gain in zip(CELLS, gains, strict=True):
+            frames[i][cell] *= gain
+    np.minimum(frames, 255.0, out=frames)
+    scales = ", ".join(f"{gain:.2f}" for gain in gains)
+    note = Note("frames.balanced", "the four planes of the colour mosaic were scaled to one "
+                f"brightness (by {scales}, row by row from the top left)")
+    return dataclasses.replace(_changed(recording, note, frames=frames), full_scale=255)
 
 
 def shifted(recording: Recording, offset_us: int) -> Recording:

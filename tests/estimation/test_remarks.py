@@ -19,15 +19,16 @@ STD = Summary(*(np.float32(v) for v in (0.01, 0.0125, 0.03, 0.04, 0.005, 0.006))
 
 def told(
     offset_dn: float, std_dn: float, due: float, log_map: LogMap = "linlog",
-    other: OtherMap | None = None,
+    other: OtherMap | None = None, delay_s: float = 0.0,
 ) -> dict[str, str]:
     """The notes, by code, where the constants' errors alone change theta by the share `due`."""
     seen = Photoreceptor(offset_dn, log_map=log_map)
     found = Found(
         seen, np.full(2, 0.3), np.full(2, 0.3), np.diag([std_dn**2, 1e-8, 1e-8]), np.full(2, due),
         (0.9, 0.9), 0.1, 0.0, 400.0, np.zeros((2, 3)), np.zeros((2, 2)), other)
-    optics = Optics(offset_dn, 0.0, std_dn, 1e-4)
-    return {note.code: note.text for note in receptor_notes(found, optics, SUMMARY, STD)}
+    optics = Optics(offset_dn, delay_s, std_dn, 1e-4)
+    return {note.code: note.text
+            for note in receptor_notes(found, optics, SUMMARY, STD, sought=True)}
 
 
 @pytest.mark.parametrize(("offset_dn", "std_dn", "due", "code"), [
@@ -57,3 +58,17 @@ def test_a_logarithm_that_the_light_leaves_open_is_told(chance: float, told_so: 
         assert "-50 % (ON) and -55 % (OFF)" in notes["pixels.map"]
         swapped = told(0.0, 1.0, 0.01, "log_eps", OtherMap(chance, np.array([2.0, 2.0])))
         assert "logarithmic, as ESIM's, and may be lin-log" in swapped["pixels.map"]
+
+
+@pytest.mark.parametrize(("delay_s", "way"), [(4e-3, "after"), (-4e-3, "before"), (2e-3, "")])
+def test_frame_times_that_disagree_with_the_events_are_told(delay_s: float, way: str) -> None:
+    notes = told(0.0, 1.0, 0.01, delay_s=delay_s)
+    assert ("frames.delay" in notes) == bool(way)
+    if way:
+        assert f"4.0 ms {way} frames" in notes["frames.delay"]
+
+
+@pytest.mark.parametrize("sought", [True, False])
+def test_a_photoreceptor_that_was_looked_for_in_vain_is_told(sought: bool) -> None:
+    notes = receptor_notes(None, None, SUMMARY, STD, sought=sought)
+    assert [note.code for note in notes] == ["pixels.open"] * sought

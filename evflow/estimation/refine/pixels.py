@@ -43,6 +43,9 @@ FEW_TO_MOST = (0.3, 0.8)  # shares of such pixels at which their gain is not use
 MOST_QUANTILE = 0.725  # of the known pixels' ratios
 GAIN = 0.95  # where it is not measured; of 37 simulated recordings of .3 and 2 s, .92 (median)
 GAINS = (0.5, 1.1)  # a gain outside of these is not one of contrast, and is ignored
+# Share of the prior's variance left, of pixels that tell something; their least share; and the
+# ratio of all together where the gain is GAIN: of four recordings .75 to .8.
+LEARNED, LEAST_LEARNED, POOLED = 0.6, 0.1, 0.75
 GAIN_SPREAD = 0.06  # of the gain from pixel to pixel: measured on simulated recordings of 8 s
 LEAST_SIGMA = 0.01  # log units
 START_ERROR = 0.05  # log units, of the path from the first frame to another
@@ -195,6 +198,16 @@ def _regression(equations: Array, median: Array, precision: Array) -> Belief:
     return Belief(theta, covariance, s)
 
 
+def _pooled_gain(seen: Array, due: Array, covariance: Array, precision: Array) -> float:
+    """The gain where no pixel's events determine its thresholds: GAIN, but less where all of them
+    together see much less contrast than is due, as frames are too far apart for the motion."""
+    left = np.maximum(covariance[0, 0] * precision[0], covariance[1, 1] * precision[1])
+    used = left < LEARNED
+    if used.mean() < LEAST_LEARNED:
+        return GAIN
+    return GAIN * min(1.0, max(float(seen[used].sum() / due[used].sum()), GAINS[0] / 2) / POOLED)
+
+
 def _inverse(a: Array, b: Array, c: Array) -> Array:
     """(2, 2, H, W) the inverses of [[a, b], [b, c]]."""
     return np.stack([np.stack([c, -b]), np.stack([-b, a])]) / (a * c - b**2)
@@ -209,9 +222,9 @@ def _gain(equations: Array, covariance: Array, median: Array, precision: Array) 
     known = np.maximum(covariance[0, 0] * precision[0], covariance[1, 1] * precision[1]) < KNOWN
     share = float(known.mean())
     trust = float(np.interp(share, FEW_TO_MOST, (0.0, 1.0)))
-    if trust == 0:
-        return GAIN
     due = u * (aa * median[0] + ab * median[1]) + v * (ab * median[0] + bb * median[1])
+    if trust == 0:
+        return _pooled_gain(u * ay + v * by, due, covariance, precision)
     # Midway between the two cases: at 0.5 / share of the known ones, or at 0.5.
     middle = min(0.25 + 0.25 / share, MOST_QUANTILE)
     gain = float(np.quantile((u * ay + v * by)[known] / due[known], middle))
