@@ -76,8 +76,7 @@ def main(options: Options) -> dict[str, Any]:
     plots.require()
     check_finite(options)
     if not options.weights:
-        raise EvflowDataError("EV020", "--weights names no network.",
-                              "For example --weights e2vid-small evflownet-small.")
+        raise EvflowDataError("EV020", "--weights names no network.", "Name one or more.")
     if options.size is not None and not options.data:
         raise EvflowDataError("EV020", "--size without --data.", "Name the recordings.")
     at_least(0, warmup_s=options.warmup_s)

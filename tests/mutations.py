@@ -67,8 +67,8 @@ MUTATIONS = (
     Mutation("event loss", OBJECTIVE, "    for name, part in parts.items():\n        scale",
              "    for name, part in parts.items():\n        if name == 'event':\n"
              "            continue\n        scale", "tests/training/test_losses.py -k total"),
-    Mutation("event loss without gradient", OBJECTIVE, "_event_loss(generated, block, config.loss)",
-             "_event_loss(jax.lax.stop_gradient(generated), block, config.loss)",
+    Mutation("event loss without gradient", OBJECTIVE, "_event_loss(generated, block, config))",
+             "_event_loss(jax.lax.stop_gradient(generated), block, config))",
              "tests/training/test_step.py -k teaches"),
     Mutation("one data key", STEP, "return jax.random.fold_in(kind, state.step)",
              "return jax.random.fold_in(kind, 0 if use == 'data' else state.step)",

@@ -186,8 +186,8 @@ def write_events(
         events: events or, with frames, a recording.
         format: one of `WRITERS`: "dsec" (HDF5: events/{x, y, t, p}, ms_to_idx, t_offset), "npz",
             "aedat4", "aedat2", "e2vid", "event_utils", "evreal"; None chooses by the path's
-            extension (.h5: "dsec", .npz: "npz", .aedat4: "aedat4", .aedat: "aedat2", .zip and .txt:
-            "e2vid", none: "evreal").
+            extension (.npz: "npz", .aedat4: "aedat4", .aedat: "aedat2", .zip and .txt: "e2vid"), of
+            .h5 and any other "dsec".
         overwrite: replace a file that exists.
 
     Raises:
@@ -198,6 +198,10 @@ def write_events(
     if not isinstance(events, Recording):
         need(events, Events, "events", "The path comes first: write_events(path, events).")
         events = Recording.of_events(events)
+    need(path, str | os.PathLike, "path", "It comes first: write_events(path, events).")
+    suffix = Path(path).suffix.lower()
+    if format is None and (not suffix or suffix not in WRITTEN):
+        format = "dsec"
     write_recording(path, events, format, overwrite=overwrite)
 
 
@@ -213,7 +217,9 @@ def write_recording(
     Args:
         path: of the file; of a folder if it has no extension.
         recording: events and frames.
-        format: as in `write_events`.
+        format: as in `write_events`; None chooses by the path's extension (.h5: "dsec",
+            .npz: "npz", .aedat4: "aedat4", .aedat: "aedat2", .zip and .txt: "e2vid", none:
+            "evreal").
         overwrite: replace what exists.
 
     Raises:

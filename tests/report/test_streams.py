@@ -164,7 +164,15 @@ def test_noise_comes_alone_and_signal_in_company() -> None:
     # A bar turns every pixel on, then off.
     assert numbers["same_polarity"]["real"] == 0.0
     assert numbers["same_polarity"]["synthetic"] == pytest.approx(0.5, abs=0.05)
-    assert "noise rates" in describe_streams(numbers)
+    assert "noise rates" in describe_streams(alike_in_rate(numbers))
+    # A thinner stream has fewer neighbours, without any noise.
+    assert "noise rates" not in describe_streams(numbers)
+
+
+def alike_in_rate(numbers: dict[str, Any]) -> dict[str, Any]:
+    """A comparison as if both streams had as many events."""
+    rates = numbers["rate_hz"] | {"ratio": {"on": 1.0, "off": 1.0}}
+    return numbers | {"rate_hz": rates}
 
 
 def test_labels_of_times_are_whole(monkeypatch: pytest.MonkeyPatch) -> None:
