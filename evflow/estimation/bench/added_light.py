@@ -163,11 +163,12 @@ def light_notes(added: AddedLight, unit: Unit, error: Array) -> list[Note]:
             "are by levels with it.")]
     if error.max() < NOTED:
         return []
+    why, or_else = ((", as by a black level of the frames",
+                     ", or give the light of each, --lux") if unit == "DN" else ("", ""))
     return [Note(
         "levels.black", "these steps hardly tell whether pixels see more or less light than the "
-        f"levels say, as by a black level of the frames: ± {added.unsure:.1g}{of} make thresholds "
-        f"{error.max():.0%} wrong. Take four or more levels in random order, or give the light of "
-        "each, --lux.")]
+        f"levels say{why}: ± {added.unsure:.1g}{of} make thresholds {error.max():.0%} wrong. Take "
+        f"four or more levels in random order{or_else}.")]
 
 
 def _linear(level: Array, log_map: LogMap | None) -> Array:
