@@ -22,15 +22,16 @@ def planes(recording: Recording) -> np.ndarray:
     return np.array([np.median([frame[cell] for frame in frames]) for cell in CELLS])
 
 
-def looks_like_a_mosaic(recording: Recording) -> bool:
-    """Whether two planes that lie diagonally are alike, as the green ones, and another is not."""
+def mosaic_planes(recording: Recording) -> np.ndarray | None:
+    """`planes`, if two that lie diagonally are alike, as the green ones, and another is not; else
+    None."""
     if min(recording.frames.shape[1:]) < 2:
-        return False
+        return None
     medians = planes(recording)
     if medians.min() < LEAST_DN:
-        return False
+        return None
     for green, others in ((medians[[0, 3]], medians[[1, 2]]), (medians[[1, 2]], medians[[0, 3]])):
         away = np.maximum(others / green.mean(), green.mean() / others)
         if green.max() < ALIKE * green.min() and away.max() > UNEVEN:
-            return True
-    return False
+            return medians
+    return None

@@ -8,7 +8,7 @@ import pytest
 from evflow import Events, Recording
 from evflow.recordings.adjust import balanced
 from evflow.recordings.check import check
-from evflow.recordings.mosaics import looks_like_a_mosaic, planes
+from evflow.recordings.mosaics import mosaic_planes, planes
 
 SHAPE = (40, 60)
 GAINS = np.array([[0.6, 1.0], [1.0, 0.45]])
@@ -50,7 +50,7 @@ def test_a_raw_mosaic_is_told_and_can_be_balanced() -> None:
                          ids=["grey", "columns"])
 def test_other_frames_are_no_mosaic(gains: np.ndarray) -> None:
     """Unlike columns are those of a readout."""
-    assert not looks_like_a_mosaic(recorded(gains))
+    assert mosaic_planes(recorded(gains)) is None
     assert not warned(recorded(gains))
 
 

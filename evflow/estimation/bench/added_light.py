@@ -12,8 +12,9 @@ small or too large beside those between bright ones; contrast lost on fast edges
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from evflow.camera.optics import Optics
@@ -33,6 +34,7 @@ LEAST_EVENTS = 0.3  # per pixel: smaller steps do not count
 PARTS = 4  # unknowns: two thresholds, loss and light
 SPLIT = 1e-3  # of the darkest level, for derivatives
 NOTED = 0.05  # relative error of the thresholds
+DARKEST = 1e-9  # light, in any unit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,11 +56,15 @@ def seen(levels: Array, added: float, log_map: LogMap | None) -> Array:
     this light added."""
     if not added:
         return levels
+    there, back = _maps(log_map)
+    return np.asarray(there(np.maximum(back(levels) + added, DARKEST)), np.float64)
+
+
+def _maps(log_map: LogMap | None) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """From light to log intensity, and back."""
     if log_map is None:
-        return np.asarray(np.log(np.maximum(np.exp(levels) + added, 1e-9)))
-    there, back = ((log_dn, log_dn_inverse) if log_map == "log_eps" else
-                   (lin_log, lin_log_inverse))
-    return np.asarray(there(jnp.maximum(back(jnp.asarray(levels)) + added, 0.0)), np.float64)
+        return np.log, np.exp
+    return (log_dn, log_dn_inverse) if log_map == "log_eps" else (lin_log, lin_log_inverse)
 
 
 def with_added_light(
@@ -106,7 +112,7 @@ def measured_light(
         return usual
     side = np.where(up, 0, 1)
     error = _step_error(np.abs(change), theta[side], spread[side])[used]
-    darkest = float(_linear(levels.min(), log_map))
+    darkest = float(_maps(log_map)[1](levels.min()))
 
     def sizes(added: float) -> Array:
         return np.abs(np.diff(seen(levels, added, log_map)))[used] / error
@@ -141,7 +147,7 @@ def light_error(levels: Array, log_map: LogMap | None, unsure: float, known: Arr
     """(2,) relative errors of the thresholds, ON and OFF, as the levels (K + 1,) are unsure by so
     much light. known: (K,) bool."""
     change = np.diff(levels)
-    by = min(unsure, 0.5 * float(_linear(levels.min(), log_map)))
+    by = min(unsure, 0.5 * float(_maps(log_map)[1](levels.min())))
     if not by:
         return np.zeros(2)
     more, less = (np.abs(np.diff(seen(levels, sign * by, log_map))) for sign in (1.0, -1.0))
@@ -169,13 +175,6 @@ def light_notes(added: AddedLight, unit: Unit, error: Array) -> list[Note]:
         "levels.black", "these steps hardly tell whether pixels see more or less light than the "
         f"levels say{why}: ± {added.unsure:.1g}{of} make thresholds {error.max():.0%} wrong. Take "
         f"four or more levels in random order{or_else}.")]
-
-
-def _linear(level: Array, log_map: LogMap | None) -> Array:
-    if log_map is None:
-        return np.exp(level)
-    back = log_dn_inverse if log_map == "log_eps" else lin_log_inverse
-    return np.asarray(back(jnp.asarray(level)))
 
 
 def _step_error(size: Array, theta: Array, spread: Array) -> Array:

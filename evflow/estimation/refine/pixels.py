@@ -198,10 +198,10 @@ def _regression(equations: Array, median: Array, precision: Array) -> Belief:
     return Belief(theta, covariance, s)
 
 
-def _pooled_gain(seen: Array, due: Array, covariance: Array, precision: Array) -> float:
+def _pooled_gain(seen: Array, due: Array, left: Array) -> float:
     """The gain where no pixel's events determine its thresholds: GAIN, but less where all of them
-    together see much less contrast than is due, as frames are too far apart for the motion."""
-    left = np.maximum(covariance[0, 0] * precision[0], covariance[1, 1] * precision[1])
+    together see much less contrast than is due, as frames are too far apart for the motion. left:
+    share of the prior's variance."""
     used = left < LEARNED
     if used.mean() < LEAST_LEARNED:
         return GAIN
@@ -219,12 +219,13 @@ def _gain(equations: Array, covariance: Array, median: Array, precision: Array) 
     determine their thresholds. The others either have higher thresholds, or saw too little."""
     aa, ab, bb, ay, by = equations[:5]
     u, v = np.einsum("i,ij...->j...", median * precision, covariance)
-    known = np.maximum(covariance[0, 0] * precision[0], covariance[1, 1] * precision[1]) < KNOWN
+    left = np.maximum(covariance[0, 0] * precision[0], covariance[1, 1] * precision[1])
+    known = left < KNOWN
     share = float(known.mean())
     trust = float(np.interp(share, FEW_TO_MOST, (0.0, 1.0)))
     due = u * (aa * median[0] + ab * median[1]) + v * (ab * median[0] + bb * median[1])
     if trust == 0:
-        return _pooled_gain(u * ay + v * by, due, covariance, precision)
+        return _pooled_gain(u * ay + v * by, due, left)
     # Midway between the two cases: at 0.5 / share of the known ones, or at 0.5.
     middle = min(0.25 + 0.25 / share, MOST_QUANTILE)
     gain = float(np.quantile((u * ay + v * by)[known] / due[known], middle))

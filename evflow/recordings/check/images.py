@@ -7,7 +7,7 @@ import numpy as np
 from evflow.light.colour import LUMA
 from evflow.recordings.check.findings import Finding
 from evflow.recordings.contradictions import FRAMES
-from evflow.recordings.mosaics import looks_like_a_mosaic, planes
+from evflow.recordings.mosaics import mosaic_planes
 from evflow.recordings.repeats import repeated_frames
 from evflow.types import Recording, release
 
@@ -71,8 +71,8 @@ def _depth(recording: Recording) -> list[Finding]:
             "EV032", "note", f"{colour[0].rstrip('.')}.", "A pixel behind a colour filter sees "
             "only its own colour: expect larger errors of its thresholds."))
     balanced = any(note.code == "frames.balanced" for note in recording.notes)
-    if not colour and not balanced and looks_like_a_mosaic(recording):
-        shown = ", ".join(f"{v:.0f}" for v in planes(recording))
+    if not (colour or balanced) and (medians := mosaic_planes(recording)) is not None:
+        shown = ", ".join(f"{v:.0f}" for v in medians)
         found.append(Finding(
             "EV032", "warning", f"every other pixel of the frames is unlike bright (medians of the "
             f"four planes {shown} DN): a raw colour mosaic?", "Pass its pattern: --colour rggb if "
