@@ -1,7 +1,8 @@
 """Refinement by simulation: the recording's own video, simulated with the estimated camera.
 
     recording --> stretches, read one after the other    stretches.py
-    frames + recorded events --> exposure of the frames, if nobody tells it   frame_exposure.py
+    events --> signals between them                      between_events.py
+    these + frames --> exposure of the frames, if nobody tells it   frame_exposure.py
     frames --optical flow--> path (fine log frames)      path.py
     path + recorded events --> Chunk                     chunk.py
     recorded events, simulated events --> Trace          trace.py

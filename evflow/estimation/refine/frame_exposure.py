@@ -2,8 +2,11 @@
 
 A frame is the mean of the light over its exposure; events show what happens meanwhile. So the
 change of a pixel from frame to frame is that of its counts' mean over the exposures, times the
-thresholds. The length of exposure that explains the frames best is theirs. (The double integral of
-Pan et al., CVPR 2019, solved for the exposure.) No optical flow is needed.
+thresholds. (The double integral of Pan et al., CVPR 2019, solved for the exposure.) No optical flow
+is needed. Two things would bias the length that explains the frames best. Means over longer spans
+have less of the counts' rounding: so the residuals are compared with what the *neighbours'* events
+show, whose rounding is their own (instrumental variables, by two-stage least squares). And a signal
+that is drawn straight from event to event is cut where it turns: there it is an arc.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evflow.estimation.refine.between_events import SPAN_US, Signals, changes, signals_of
 from evflow.estimation.refine.path import Place
 from evflow.estimation.refine.receptor_data import TILES
 from evflow.estimation.refine.stretches import Stretch
@@ -24,18 +28,20 @@ from evflow.types import Recording, release
 
 Array = np.ndarray
 
-LENGTHS_US = 1e3 * np.array([0.5, 4.0, 8.0, 12.0, 16.0, 20.0, 25.0, 30.0, 35.0, 40.0, 50.0])
+LENGTHS_US = 1e3 * np.array([0.5, 6.0, 12.0, 16.0, 20.0, 25.0, 30.0, 35.0, 40.0, 50.0])
+SHARPER = 1e6 * np.array([-900.0, -400.0, -150.0])  # squares of lengths: events blurred, not frames
+MIDDLE_US = 10e3  # length at which the delay and the offset are sought
+SHOWN_US = 8e3, 24e3  # over which neighbours' counts are averaged: their difference is curvature
 DELAYS_US = 1e3 * np.arange(-6.0, 11.0, 2.0)  # of events after frames: slow pixels, and clocks
+REACH_US = 0.5 * LENGTHS_US[-1] - DELAYS_US[0], 0.5 * LENGTHS_US[-1] + DELAYS_US[-1]
 OFFSETS = (-16.0, -8.0, 0.0, 8.0, 16.0, 26.0, 40.0)  # DN
 BEYOND = 1.3  # times the interval between frames, so that an exposure as long as that is inside
-SPAN_US = 40_000.0  # longest time between two events over which a signal is interpolated
 BUSY = 4.0  # events between two frames: of fewer the interpolated signal looks smooth itself
-MOST, ENOUGH = 5_000, 500  # changes used of a run; in all
-LEAST_S = 1e-2  # shorter ones are found where there is none: the interpolation is never exact
-CLEARLY, LEAST_GAIN = 3.0, 0.01  # of log unexplained share: its standard deviations, and at least
+MOST, ENOUGH = 5_000, 150  # changes used of a run; in all
+CLEARLY, BIAS = 3.0, 60e6  # std of the square of the length that are none; its error in a scene
 TELLING = (BLURRED, "frames.dense")  # notes of recordings in which it is not to be measured
 NOTHING = 1e-9  # of the sums, so that one polarity alone, or no change, can be solved
-FEWEST = 4  # tiles, over which a gain's scatter says something
+FEWEST = 4  # tiles, over which a length's scatter says something
 FLOOR_S = 2.5e-3  # std beside the scatter, of simulated cameras exposed for 10 and 20 ms
 
 
@@ -51,18 +57,11 @@ UNSEEN = Exposure()
 
 
 class Busy(NamedTuple):
-    """Where much happens between two frames of a run. times_us: (K + 1,) of the frames; pixels:
-    number of those with such changes. Their events (N,) by pixel and time: pixel; on; and since_us,
-    at_us, between which the pixel's signal is interpolated. Changes (M,): where, index of interval
-    and pixel; before, after, DN; block, of the image."""
+    """Where much happens between two frames of a run. own: of those pixels; around: of their four
+    neighbours. Changes (M,): before, after, DN; block, of the image."""
 
-    times_us: Array
-    pixels: int
-    pixel: Array
-    on: Array
-    since_us: Array
-    at_us: Array
-    where: Array
+    own: Signals
+    around: Signals
     before: Array
     after: Array
     block: Array
@@ -76,32 +75,28 @@ def frame_exposure(places: Sequence[Place]) -> Exposure:
     runs = [_busy(recording, run, rng) for recording, run in places]
     for recording, _ in places:
         release(recording)
-    if sum(len(run.where) for run in runs) < ENOUGH:
+    if sum(len(run.block) for run in runs) < ENOUGH:
         return UNSEEN
-    interval = float(np.median(np.concatenate([np.diff(run.times_us) for run in runs])))
+    interval = float(np.median(np.concatenate([np.diff(run.own.times_us) for run in runs])))
     lengths = LENGTHS_US[BEYOND * interval >= LENGTHS_US]
-    if lengths.max(initial=0.0) <= 1e6 * LEAST_S:
+    if lengths.max(initial=0.0)**2 <= CLEARLY * BIAS:
         return UNSEEN
-    best, delay = min(10e3, lengths[-1]), np.nan
-    for _ in range(2):
-        before = delay
-        delay = min(DELAYS_US, key=lambda d: _logs(_products(runs, best, d)).min())
-        if delay == before:
-            break
-        table = np.stack([_products(runs, length, delay) for length in lengths])
-        offset = int(np.argmin(_logs(table).min(0)))
-        best, _ = _least(lengths, _logs(table[:, offset]))
-    of_blocks = table[:, offset]
+    middle = min(MIDDLE_US, lengths[-1])
+    logs = np.stack([_unexplained(runs, middle, delay) for delay in DELAYS_US])
+    delay, offset = (int(k) for k in np.unravel_index(np.argmin(logs), logs.shape))
+    if delay in (0, len(DELAYS_US) - 1):
+        return UNSEEN
+    of_blocks = _products(runs, lengths, DELAYS_US[delay], OFFSETS[offset])
     used = np.flatnonzero(np.trace(of_blocks[0], axis1=1, axis2=2))
-    if len(used) < FEWEST or delay in DELAYS_US[[0, -1]]:
+    if len(used) < FEWEST:
         return UNSEEN
-    found = np.array([_least(lengths, _logs(np.delete(of_blocks, b, 1))) for b in used])
-    _, gain = _least(lengths, _logs(of_blocks))
-    scatter, error = np.sqrt((len(used) - 1) * found.var(0))
-    seen = (best >= 1e6 * LEAST_S and best < lengths[-1] and gain > LEAST_GAIN
-            and gain > CLEARLY * error)
-    seconds, std_s = 1e-6 * min(best, interval), float(np.hypot(1e-6 * scatter, FLOOR_S))
-    return Exposure(seconds, std_s) if seen else UNSEEN
+    square = _least(lengths, of_blocks)
+    found = np.array([_least(lengths, np.delete(of_blocks, b, 1)) for b in used])
+    error = np.sqrt((len(used) - 1) * found.var())
+    best = max(square, 0.0) ** 0.5
+    if square <= CLEARLY * np.hypot(error, BIAS) or best >= lengths[-1]:
+        return UNSEEN
+    return Exposure(1e-6 * min(best, interval), float(np.hypot(5e-7 * error / best, FLOOR_S)))
 
 
 def with_exposures(
@@ -136,45 +131,24 @@ def _busy(recording: Recording, run: Sequence[int], rng: np.random.Generator) ->
     frames = np.stack([recording.frame_dn(i) for i in [*run, run[-1] + 1]])
     times = recording.frame_times[run[0]:run[-1] + 2].astype(np.float64)
     height, width = frames.shape[1:]
-    pixels = height * width
     events = recording.events.slice(int(times[0] - SPAN_US), int(times[-1] + SPAN_US))
     pixel, at = events.y.astype(np.int64) * width + events.x, events.t.astype(np.float64)
-    number = _smooth_numbers(times, at, pixel, pixels)
-    shown = np.stack([glitches.exposed(frame) for frame in frames]).reshape(len(frames), -1)
+    number = _smooth_numbers(times, at, pixel, height * width)
+    shown = np.stack([glitches.exposed(frame) for frame in frames])
+    shown[:, [0, -1]] = shown[:, :, [0, -1]] = False  # they lack a neighbour
+    shown = shown.reshape(len(frames), -1)
     where = np.flatnonzero((shown[1:] & shown[:-1]).ravel() & (number > BUSY))
     if len(where) > MOST:
         where = np.sort(rng.choice(where, MOST, replace=False))
-    place = where % pixels
-    used, row = np.unique(place, return_inverse=True)
-    row_of = np.full(pixels, -1)
-    row_of[used] = np.arange(len(used))
-    kept = np.flatnonzero(row_of[pixel] >= 0)
-    kept = kept[np.argsort(row_of[pixel[kept]], kind="stable")]
-    pixel, on, at = row_of[pixel[kept]], events.p[kept], at[kept]
-    since = np.where(np.diff(pixel, prepend=-1) == 0, np.roll(at, 1), at)
-    since = np.clip(since, at - SPAN_US, at - 1.0)
-    where = where // pixels * len(used) + row
-    near = _near(times, len(used), where, pixel, since, at)
+    interval, place = np.divmod(where, height * width)
+    around = place + np.array([-width, -1, 1, width])[:, None]
+    order = np.argsort(pixel, kind="stable")
+    sent = pixel[order], events.p[order], at[order]
     light = frames.reshape(len(frames), -1)
     y, x = place // width * TILES[0] // height, place % width * TILES[1] // width
-    return Busy(times, len(used), pixel[near], on[near], since[near], at[near], where,
-                light[:-1][where // len(used), place], light[1:][where // len(used), place],
-                y * TILES[1] + x)
-
-
-def _near(
-    times: Array, pixels: int, where: Array, pixel: Array, since: Array, at: Array
-) -> Array:
-    """Which events (N,) can have a part in the changes `where`, at any length and delay."""
-    chosen = np.zeros((len(times) - 1) * pixels, np.int64)
-    chosen[where] = 1
-    before = np.zeros((len(times), pixels), np.int64)
-    before[1:] = chosen.reshape(len(times) - 1, pixels).cumsum(0)
-    half = 0.5 * LENGTHS_US[-1]
-    first = np.searchsorted(times, since - half - DELAYS_US[-1]) - 1
-    last = np.searchsorted(times, at + half - DELAYS_US[0])
-    first, last = (np.clip(k, 0, len(times) - 1) for k in (first, last))
-    return np.flatnonzero(before[last, pixel] > before[first, pixel])
+    return Busy(signals_of(times, interval, place, sent, REACH_US),
+                signals_of(times, interval, around, sent, REACH_US),
+                light[:-1][interval, place], light[1:][interval, place], y * TILES[1] + x)
 
 
 def _smooth_numbers(times: Array, at: Array, pixel: Array, pixels: int) -> Array:
@@ -191,62 +165,61 @@ def _smooth_numbers(times: Array, at: Array, pixel: Array, pixels: int) -> Array
     return number
 
 
-def _changes(run: Busy, length_us: float, delay_us: float) -> Array:
-    """(2, K * pixels) changes of the ON and OFF counts' means over so long about the frames."""
-    times, half = run.times_us + delay_us, 0.5 * length_us
-    total = np.zeros((2, (len(times) - 1) * run.pixels))
-
-    def passed(to: Array, since: Array, at: Array) -> Array:
-        """Integral up to a time of what rises from 0 at `since` to 1 at `at`."""
-        inside = np.clip(to - since, 0.0, at - since)
-        return inside * inside / (2.0 * (at - since)) + np.maximum(to - at, 0.0)
-
-    first = np.searchsorted(times, run.since_us - half) - 1
-    last = np.searchsorted(times, run.at_us + half)
-    for more in range(int((last - first).max(initial=0))):
-        interval = first + more
-        k = np.flatnonzero((interval >= 0) & (interval < len(times) - 1) & (interval < last))
-        i, event = interval[k], (run.since_us[k], run.at_us[k])
-        before, after = (passed(times[j] + half, *event) - passed(times[j] - half, *event)
-                         for j in (i, i + 1))
-        share = (after - before) / length_us
-        for row, which in zip(total, (run.on[k], ~run.on[k]), strict=True):
-            row += np.bincount((i * run.pixels + run.pixel[k])[which], share[which], len(row))
-    return total
+def _of_frames(run: Busy, offset: float) -> Array:
+    """(M,) changes of the log of the frames."""
+    before, after = (log64(np.maximum(dn + offset, 0.0), "linlog")
+                     for dn in (run.before, run.after))
+    return after - before
 
 
-def _products(runs: Sequence[Busy], length_us: float, delay_us: float) -> Array:
-    """(OFFSETS, blocks, 3, 3): products of the changes of ON, of minus OFF, and of the frames."""
+def _unexplained(runs: Sequence[Busy], length_us: float, delay_us: float) -> Array:
+    """(OFFSETS,) log of the share that least squares leave."""
+    counts = np.concatenate([changes(run.own, length_us, delay_us) for run in runs], 1)
+    of_frames = np.stack([np.concatenate([_of_frames(run, o) for run in runs]) for o in OFFSETS])
+    on_off = counts @ counts.T
+    size = NOTHING * (1.0 + np.trace(on_off))
+    both = of_frames @ counts.T
+    total = (of_frames**2).sum(1) + NOTHING
+    explained = (both * np.linalg.solve(on_off + size * np.eye(2), both.T).T).sum(1)
+    return np.log(np.maximum(total - explained, NOTHING * total) / total)
+
+
+def _products(
+    runs: Sequence[Busy], lengths: Array, delay_us: float, offset: float
+) -> Array:
+    """(lengths, blocks, 7, 7): products of what neighbours show, (4,), the changes of ON and minus
+    OFF, and those of the frames."""
     found = []
     for run in runs:
-        on, off = _changes(run, length_us, delay_us)[:, run.where]
-        of_offsets = []
-        for offset in OFFSETS:
-            before, after = (log64(np.maximum(dn + offset, 0.0), "linlog")
-                             for dn in (run.before, run.after))
-            columns = on, -off, after - before
-            of_offsets.append(np.stack([[np.bincount(run.block, a * b, TILES[0] * TILES[1])
-                                         for a in columns] for b in columns]))
-        found.append(np.moveaxis(np.stack(of_offsets), -1, 1))
+        shown = [changes(run.around, over, delay_us).mean(1) for over in SHOWN_US]
+        fixed, of_frames = np.concatenate(shown), _of_frames(run, offset)[None]
+        of_lengths = []
+        for length in lengths:
+            columns = np.concatenate([fixed, changes(run.own, length, delay_us), of_frames])
+            of_lengths.append([[np.bincount(run.block, a * b, TILES[0] * TILES[1])
+                                for a in columns] for b in columns])
+        found.append(np.moveaxis(np.asarray(of_lengths), -1, 1))
     return np.concatenate(found, 1)
 
 
-def _logs(products: Array) -> Array:
-    """Log of the unexplained share, of products (..., blocks, 3, 3)."""
-    total = products.sum(-3)
-    size = NOTHING * (1.0 + np.trace(total, axis1=-2, axis2=-1))
-    total = total + size[..., None, None] * np.eye(3)
-    theta = np.linalg.solve(total[..., :2, :2], total[..., :2, 2:])[..., 0]
-    left = total[..., 2, 2] - (theta * total[..., :2, 2]).sum(-1)
-    return np.log(np.maximum(left / total[..., 2, 2], NOTHING))
-
-
-def _least(lengths: Array, logs: Array) -> tuple[float, float]:
-    """Where the curve is lowest, by a parabola, and how much lower than at no exposure."""
-    k = int(np.argmin(logs))
-    gain = float(logs[0] - logs[k])
-    if 0 < k < len(lengths) - 1:
-        away = lengths[k - 1:k + 2] - lengths[k]
-        bent, slope, _ = np.polyfit(away, logs[k - 1:k + 2], 2)
-        return float(lengths[k] + np.clip(-slope / (2 * bent), away[0], away[2])), gain
-    return float(lengths[k]), gain
+def _least(lengths: Array, of_blocks: Array) -> float:
+    """The square of the length whose residuals have least to do with what neighbours show, by a
+    parabola; below none, where it is linear in the square, too."""
+    total = of_blocks.sum(1)
+    squares = np.concatenate([SHARPER, lengths**2])
+    k = min(2, len(lengths) - 1)  # a length that differs from none beyond rounding
+    bend = (total[k] - total[0]) / (lengths[k]**2 - lengths[0]**2)
+    total = np.concatenate([total[0] + SHARPER[:, None, None] * bend, total])
+    size = NOTHING * (1.0 + np.trace(total[-1]))
+    weight = np.linalg.inv(total[..., :4, :4] + size * np.eye(4))
+    counts, frames = total[..., :4, 4:6], total[..., :4, 6:]
+    weighted = np.swapaxes(counts, -1, -2) @ weight
+    theta = np.linalg.solve(weighted @ counts + NOTHING * np.eye(2), weighted @ frames)
+    left = frames - counts @ theta
+    misfit = (np.swapaxes(left, -1, -2) @ weight @ left)[:, 0, 0]
+    k = int(np.clip(np.argmin(misfit), 1, len(squares) - 2))
+    away = squares[k - 1:k + 2] - squares[k]
+    bent, slope, _ = np.polyfit(1e-6 * away, misfit[k - 1:k + 2], 2)
+    if bent <= 0.0:
+        return float(squares[np.argmin(misfit)])
+    return float(squares[k] + np.clip(-1e6 * slope / (2 * bent), away[0], away[2]))
