@@ -170,10 +170,9 @@ class Reading:
 
 
 def _aligned(recording: Recording) -> Recording:
-    from evflow.recordings import adjust
-    from evflow.recordings.check import frames_offset
+    from evflow.estimation.clock import aligned
 
-    return adjust.shifted(recording, frames_offset(recording))
+    return aligned(recording)
 
 
 def given(options: Any, names: Iterable[str]) -> str:

@@ -15,13 +15,14 @@ from evflow.estimation.finish import estimate
 from evflow.estimation.front_end import (
     FrontEnd,
     agree,
-    find_exposure,
     find_front_end,
+    find_timing,
     with_dead_time,
 )
 from evflow.estimation.pipeline import check_options
 from evflow.estimation.refine import Stretch, cut
-from evflow.estimation.refine.frame_exposure import Exposure, with_exposures
+from evflow.estimation.refine.frame_exposure import with_exposures
+from evflow.estimation.refine.frame_timing import Timing
 from evflow.estimation.refine.stretches import most_simulated, spread
 from evflow.estimation.result import CameraEstimate
 from evflow.estimation.state import State, add, thinned
@@ -142,7 +143,7 @@ class CameraEstimator:
                 self._state = self._begun()
                 self._waiting = ()
         else:
-            for stretch in with_exposures(stretches, self._state.front_end.exposure):
+            for stretch in with_exposures(stretches, self._state.front_end.timing.exposure):
                 self._state = self._next(self._state, stretch)
             if sum(map(_events, self._busiest)) > self.AGAIN * self._measured:
                 self._state = self._again(self._state)
@@ -186,13 +187,13 @@ class CameraEstimator:
         """The state, or where its front end is not that of the busiest stretches, a new one of the
         stretches that are kept."""
         self._measured = sum(map(_events, self._busiest))
-        exposure = find_exposure(self._busiest, measured=self._is_measured)
-        before = state.front_end.exposure
-        exposure = exposure if exposure.seconds else before
+        timing = find_timing(self._busiest, measured=self._is_measured)
+        before = state.front_end.timing.exposure
+        timing = timing if timing.exposure.seconds else timing._replace(exposure=before)
         kept = {_place(s): s for s in (*state.read, *self._busiest)}
-        stretches = with_exposures([kept[place] for place in sorted(kept)], exposure, before)
+        stretches = with_exposures([kept[place] for place in sorted(kept)], timing.exposure, before)
         busiest = {_place(s) for s in self._busiest}
-        front_end = self._front_end([s for s in stretches if _place(s) in busiest], exposure)
+        front_end = self._front_end([s for s in stretches if _place(s) in busiest], timing)
         if agree(state.front_end, front_end):
             return dataclasses.replace(
                 state, front_end=with_dead_time(state.front_end, front_end))
@@ -202,12 +203,12 @@ class CameraEstimator:
 
     def _begun(self) -> State:
         """The state of the stretches that wait."""
-        exposure = find_exposure(self._waiting, measured=self._is_measured)
-        stretches = with_exposures(self._waiting, exposure)
-        return self._read(stretches, self._front_end(stretches, exposure))
+        timing = find_timing(self._waiting, measured=self._is_measured)
+        stretches = with_exposures(self._waiting, timing.exposure)
+        return self._read(stretches, self._front_end(stretches, timing))
 
-    def _front_end(self, stretches: Sequence[Stretch], exposure: Exposure) -> FrontEnd:
-        return find_front_end(stretches, exposure, measured=self._is_measured)
+    def _front_end(self, stretches: Sequence[Stretch], timing: Timing) -> FrontEnd:
+        return find_front_end(stretches, timing, measured=self._is_measured)
 
     def _read(self, stretches: tuple[Stretch, ...], front_end: FrontEnd) -> State:
         """The state of some stretches."""

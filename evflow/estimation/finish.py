@@ -29,10 +29,10 @@ from evflow.estimation.refine import Chunk
 from evflow.estimation.remarks import (
     camera_notes,
     drift_notes,
-    exposure_notes,
     lost_notes,
     noise_notes,
     receptor_notes,
+    timing_notes,
 )
 from evflow.estimation.result import CameraEstimate
 from evflow.estimation.shot import Shot, at_mean_light, measured_noise, measured_shot, scatter
@@ -152,7 +152,7 @@ def estimate(
         (*before, *camera_notes(stats, lacking, alone, n_events, summary, hot, dead, by_drift),
          *receptor_notes(
              front_end.found, refined.optics, summary, std, sought=front_end.sought),
-         *exposure_notes(front_end.exposure), *lost_notes(lost, as_sent, summary),
+         *timing_notes(front_end.timing, refined.optics), *lost_notes(lost, as_sent, summary),
          *noise_notes(shot),
          *drift_notes(quiet.drift, by_drift), *after, *extent.notes(), *drift.notes(thirds)),
         tuple(f"theta_{name}" for name in lacking),
@@ -208,7 +208,7 @@ def _measured(
                   sensor, refractory_s=dead.seconds,
                   dead_contrast="auto" if law == "keeps" else law),
               "sensor_std": {**std, "refractory_s": dead.std_s}}
-    exposure = front_end.exposure
+    exposure = front_end.timing.exposure
     fields["optics"] = dataclasses.replace(
         optics or Optics(), exposure_s=exposure.seconds, exposure_s_std=exposure.std_s)
     return {**fields, "receptor": found} if found else fields

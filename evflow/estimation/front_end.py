@@ -13,7 +13,8 @@ import numpy as np
 from evflow.camera.sensors import DeadContrast
 from evflow.estimation.dead_time import DeadTime, dead_time, first_events
 from evflow.estimation.refine import Found, Lost, Stretch, find_photoreceptor, frame_noise
-from evflow.estimation.refine.frame_exposure import UNSEEN, Exposure, frame_exposure
+from evflow.estimation.refine.frame_exposure import Exposure
+from evflow.estimation.refine.frame_timing import UNTIMED, Timing, frame_timing
 from evflow.estimation.refine.path import Films
 from evflow.estimation.refine.photoreceptor import STRETCHES, receptor_places
 from evflow.recordings.faulty_pixels import dead_pixels, hot_among_neighbours
@@ -28,7 +29,7 @@ class FrontEnd:
     and their exposure, 0 if it is unknown; found: the search for the photoreceptor, None if there
     was none; dead: the dead time; lost: the contrast that pixels lose in it, None if they send it
     all; faulty: (H, W) bool, pixels that fire alone or never, None if there are none; films: of
-    stretches that are still to be read; exposure: of the frames, if it was measured; sought:
+    stretches that are still to be read; timing: of the frames, as far as it was measured; sought:
     whether a photoreceptor was looked for."""
 
     seen_by: Photoreceptor = IDEAL
@@ -39,7 +40,7 @@ class FrontEnd:
     lost: Lost | None = None
     faulty: np.ndarray | None = None
     films: Films = dataclasses.field(default_factory=dict)
-    exposure: Exposure = UNSEEN
+    timing: Timing = UNTIMED
     sought: bool = False
 
     @property
@@ -48,28 +49,29 @@ class FrontEnd:
         return self.lost.law if self.lost else "keeps"
 
 
-def find_exposure(stretches: Sequence[Stretch], *, measured: bool) -> Exposure:
-    """The exposure of the frames, where nobody says it and their blur shows it. Events that wait
-    for a long dead time are as if blurred themselves: there it is not known. measured: as of
-    `find_front_end`."""
-    if not measured:
-        return UNSEEN
-    found = frame_exposure(receptor_places([(s.recording, s.run) for s in stretches if s.run]))
-    if found.seconds and _dead_time(stretches).seconds > WAITING_S:
-        return UNSEEN
+def find_timing(stretches: Sequence[Stretch], *, measured: bool) -> Timing:
+    """The exposure of the frames, where nobody says it and their blur shows it, and what their
+    times are wrong by. Events that wait for a long dead time are late and as if blurred themselves:
+    there nothing is known. measured: as of `find_front_end`."""
+    places = receptor_places([(s.recording, s.run) for s in stretches if s.run])
+    if not measured or not places:
+        return UNTIMED
+    found = frame_timing(places)
+    if found != UNTIMED and _dead_time(stretches).seconds > WAITING_S:
+        return UNTIMED
     return found
 
 
 def find_front_end(
-    stretches: Sequence[Stretch], exposure: Exposure = UNSEEN, *, measured: bool
+    stretches: Sequence[Stretch], timing: Timing = UNTIMED, *, measured: bool
 ) -> FrontEnd:
-    """Measure the front end on some stretches of a recording. exposure: as measured, if the
-    recordings have it. measured: False assumes ideal pixels."""
+    """Measure the front end on some stretches of a recording. timing: as measured; the
+    recordings have its exposure. measured: False assumes ideal pixels."""
     dead = _dead_time(stretches)
     faulty = _faulty(stretches)
     runs = [(s.recording, s.run) for s in stretches if s.run]
     if not runs:
-        return FrontEnd(dead=dead, faulty=faulty, exposure=exposure)
+        return FrontEnd(dead=dead, faulty=faulty, timing=timing)
     noise_dn = frame_noise([(recording, i) for recording, run in runs for i in run])
     films: Films = {}
     found, lost = (find_photoreceptor(
@@ -78,7 +80,7 @@ def find_front_end(
     blur_s = 1e-6 * float(np.mean([recording.exposure_us for recording, _ in runs]))
     seen_by = found.used if found else IDEAL
     return FrontEnd(seen_by, noise_dn, blur_s, found, settled(dead, lost), lost, faulty, films,
-                    exposure, sought=measured)
+                    timing, sought=measured)
 
 
 def settled(dead: DeadTime, lost: Lost | None) -> DeadTime:
@@ -93,7 +95,7 @@ def agree(before: FrontEnd, now: FrontEnd) -> bool:
     same laws, and constants within two of its standard deviations."""
     if before.found is None or now.found is None:
         return now.found is None
-    if before.law != now.law or not _same(before.exposure, now.exposure):
+    if before.law != now.law or not _same(before.timing.exposure, now.timing.exposure):
         return False
     one, other = before.seen_by, now.seen_by
     away = [getattr(one, name) - getattr(other, name) for name in ("offset_dn", "tau_s", "delay_s")]

@@ -24,7 +24,7 @@ from evflow.camera import Summary
 from evflow.errors import EvflowDataError
 from evflow.estimation.extent import Extent, covered_s
 from evflow.estimation.finish import Stage, estimate
-from evflow.estimation.front_end import find_exposure, find_front_end
+from evflow.estimation.front_end import find_front_end, find_timing
 from evflow.estimation.halves import FirstPart, divided
 from evflow.estimation.reading import BATCH, BUDGETS, EFFORTS, Effort, Order, gain, ordered
 from evflow.estimation.refine import Stretch, cut, pixel_posterior
@@ -132,10 +132,10 @@ def measure(
     release(recording)
     stage("looking for the photoreceptor")
     measured = pixel == "measured"
-    exposure = find_exposure(_used(stretches, order), measured=measured)
-    stretches = with_exposures(stretches, exposure)
+    timing = find_timing(_used(stretches, order), measured=measured)
+    stretches = with_exposures(stretches, timing.exposure)
     used = _used(stretches, order)
-    state = State(params, find_front_end(used, exposure, measured=measured))
+    state = State(params, find_front_end(used, timing, measured=measured))
     counter = ProgressCounter(used, progress)
     stage("reading stretches")
     division = divided(stretches)
@@ -175,9 +175,9 @@ def read_whole(recording: Recording, params: api.Params) -> State:
     plan = plan_windows(recording)
     iter_windows(recording, plan=plan)
     stretches = cut(recording, plan)
-    exposure = find_exposure(stretches, measured=True)
-    stretches = with_exposures(stretches, exposure)
-    state = State(params, find_front_end(stretches, exposure, measured=True))
+    timing = find_timing(stretches, measured=True)
+    stretches = with_exposures(stretches, timing.exposure)
+    state = State(params, find_front_end(stretches, timing, measured=True))
     simulated = ordered(stretches, "full").simulated
     for i, stretch in enumerate(stretches):
         state = add(state, stretch, simulate=i in simulated)

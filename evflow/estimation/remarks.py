@@ -7,7 +7,7 @@ import numpy as np
 from evflow.camera import Summary
 from evflow.camera.optics import Optics
 from evflow.estimation.refine import Found, Lost
-from evflow.estimation.refine.frame_exposure import Exposure
+from evflow.estimation.refine.frame_timing import Timing
 from evflow.estimation.refine.receptor_result import OtherMap
 from evflow.estimation.shot import Shot
 from evflow.network.pooling import Stats
@@ -19,7 +19,7 @@ OPEN = 0.5  # of the stated error of theta: a log map that is told to be open is
 UNDETERMINED = 2.0  # times the stated error of theta: what the light alone may change is told
 FEW_EVENTS = 200  # of a polarity: with fewer its threshold is called uncertain
 
-LATE_S = 2.5e-3  # three standard deviations of frame times, a priori
+LATE_S = 2.5e-3  # three standard deviations of frame times, a priori; up to 4 ms are looked for
 
 UNMEASURED = Note(
     "pixels.open", "whether pixels are slow, and see other light than the frames show, was not "
@@ -91,13 +91,6 @@ def receptor_notes(
     notes = [Note("pixels.fast", "the photoreceptor is too fast for its cutoff to be measured: it "
                   f"is above {found.least_cutoff_hz:.0f} Hz at 255 DN, if it is proportional to "
                   "light.")]
-    if abs(optics.delay_s) > LATE_S:
-        late = "after" if optics.delay_s > 0 else "before"
-        notes.append(Note(
-            "frames.delay", f"events come {1e3 * abs(optics.delay_s):.1f} ms {late} frames that "
-            "show the same (up to 4 ms are looked for): frame times are probably wrong, as those "
-            "of the exposure's begin or end, or of another clock. If so the cutoff is, and noise "
-            "rates and maps may be, too; thresholds suffer least. Pass --frames-offset-ms."))
     if found.sensor[0].cutoff_hz:
         notes = [Note("pixels.slow", "the thresholds refer to light filtered by the "
                       "photoreceptor's low-pass"
@@ -138,13 +131,28 @@ def map_note(other: OtherMap, logarithmic: bool) -> Note:
         "above 20 DN: record a brighter scene.")
 
 
-def exposure_notes(exposure: Exposure) -> list[Note]:
-    return [Note(
+def timing_notes(timing: Timing, optics: Optics | None) -> list[Note]:
+    exposure, late = timing.exposure, timing.late
+    by, much = (late.seconds, f"{1e3 * abs(late.seconds):.1f} ± {1e3 * late.std_s:.1f} ms")
+    advice = f"Pass --frames-offset-ms {1e3 * by:.1f}, or auto."
+    if late.exposed_s:
+        advice += (f" (Frames exposed for {1e3 * late.exposed_s:.0f} ms before slow pixels look "
+                   "alike: --exposure-ms, if that is so.)")
+    if not by and optics is not None and abs(optics.delay_s) > LATE_S:
+        by, much = optics.delay_s, f"{1e3 * abs(optics.delay_s):.1f} ms"
+        advice = "Pass --frames-offset-ms."
+    found = [Note(
+        "frames.delay", f"events come {much} {'after' if by > 0 else 'before'} frames that show "
+        "the same: frame times are probably wrong, as those of the exposure's begin or end, or of "
+        "another clock. If so the cutoff is wrong too, and maps, noise rates and even thresholds "
+        f"may be. {advice}")] if by else []
+    if not exposure.seconds:
+        return found
+    return [*found, Note(
         "frames.exposure", "what moves is blurred in the frames, and not in the events, as by an "
         f"exposure of {1e3 * exposure.seconds:.0f} ± {1e3 * exposure.std_s:.0f} ms (frames out of "
         "focus look alike): the blur was taken out (--exposure-ms: the right one, or 0 to leave "
-        "the blur)."
-    )] if exposure.seconds else []
+        "the blur).")]
 
 
 def lost_notes(lost: Lost | None, as_sent: Summary, summary: Summary) -> list[Note]:

@@ -16,6 +16,7 @@ from evflow.estimation.extent import covered_s
 from evflow.estimation.front_end import FrontEnd
 from evflow.estimation.refine import stretches as cutting
 from evflow.estimation.refine.frame_exposure import UNSEEN, Exposure
+from evflow.estimation.refine.frame_timing import Timing
 from evflow.estimation.state import State, thinned
 from evflow.types import Events
 
@@ -185,9 +186,9 @@ def test_an_exposure_that_is_seen_later_is_that_of_all_that_is_kept(
     recording, _ = hidden(3)
     seen = iter([UNSEEN, Exposure(0.012, 0.002), Exposure(0.015, 0.002), UNSEEN])
     exposures: list[set[int]] = []
-    monkeypatch.setattr(estimator_module, "find_exposure", lambda _, measured: next(seen))
-    monkeypatch.setattr(estimator_module, "find_front_end", lambda on, exposure, **_: (
-        exposures.append({s.recording.exposure_us for s in on}), FrontEnd(exposure=exposure))[1])
+    monkeypatch.setattr(estimator_module, "find_timing", lambda _, measured: Timing(next(seen)))
+    monkeypatch.setattr(estimator_module, "find_front_end", lambda on, timing, **_: (
+        exposures.append({s.recording.exposure_us for s in on}), FrontEnd(timing=timing))[1])
     monkeypatch.setattr(estimator_module, "agree", lambda *_: False)
     monkeypatch.setattr(CameraEstimator, "FIRST", 1)
     monkeypatch.setattr(CameraEstimator, "AGAIN", 0.0)

@@ -1,8 +1,9 @@
-"""The exposure of frames that nobody tells, from what it blurs."""
+"""When frames were exposed and for how long, from what they show of the events."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,17 +14,19 @@ from helpers.films import FRAME_S, INTERVALS, integrated, view
 from evflow import CameraEstimator, Recording, estimate_camera, read_recording
 from evflow.camera.optics import read_sensor
 from evflow.estimation import front_end
+from evflow.estimation.clock import aligned
 from evflow.estimation.dead_time import DeadTime
 from evflow.estimation.refine import between_events
-from evflow.estimation.refine import frame_exposure as frame_exposure_module
+from evflow.estimation.refine import frame_timing as frame_timing_module
 from evflow.estimation.refine.frame_exposure import (
+    ON_TIME,
     UNSEEN,
     Exposure,
-    frame_exposure,
     is_untold,
     with_exposure,
     with_exposures,
 )
+from evflow.estimation.refine.frame_timing import UNTIMED, frame_timing
 from evflow.estimation.refine.path import STEPS
 from evflow.estimation.refine.stretches import cut
 from evflow.notes import Note
@@ -35,15 +38,20 @@ STEP_US = 1e6 * FRAME_S / STEPS
 RUN = tuple(range(INTERVALS - 2))
 
 
-def blurred(steps: int, theta: float = 0.1, offset_dn: float = 0.0) -> Recording:
-    """A texture that swings past, its frames exposed for so many steps: one instant and event at a
-    time. Without the film's first and last frame, whose exposure is not in it."""
+@functools.cache
+def blurred(
+    steps: int, theta: float = 0.1, offset_dn: float = 0.0, tau_s: float = 0.0,
+    every: int = STEPS,
+) -> Recording:
+    """A texture that swings past, a frame `every` so many steps, exposed for some, before pixels of
+    this time constant: one instant and event at a time. Without the film's first and last frame,
+    whose exposure is not in it."""
     dn = view(2)
     light = np.cumsum(np.concatenate([np.zeros((1, *dn.shape[1:])), 0.5 * (dn[1:] + dn[:-1])]), 0)
-    middle = np.arange(1, INTERVALS) * STEPS
+    middle = np.arange(STEPS, INTERVALS * STEPS, every)
     half = steps // 2
     frames = dn[middle] if not half else (light[middle + half] - light[middle - half]) / (2 * half)
-    path = integrated(dn + offset_dn, FRAME_S / STEPS, 0.0, 0.0, 8)
+    path = integrated(dn + offset_dn, FRAME_S / STEPS, 0.0, tau_s, 8, by_light=False)
     memory, rows = path[0].copy(), []
     for i, now in enumerate(path):
         while (crossed := np.abs(now - memory) > theta).any():
@@ -56,13 +64,20 @@ def blurred(steps: int, theta: float = 0.1, offset_dn: float = 0.0) -> Recording
                      np.round(middle * STEP_US).astype(np.int64))
 
 
+def moved(recording: Recording, ms: float) -> Recording:
+    """With other frame times."""
+    times = recording.frame_times + round(1e3 * ms)
+    return dataclasses.replace(recording, frame_times=times)
+
+
 @pytest.mark.parametrize(("steps", "offset_dn"), [(0, 20.0), (12, 0.0), (12, 20.0), (16, 0.0)])
 @pytest.mark.parametrize("theta", [0.1, 0.2])
 def test_the_length_that_explains_the_frames_is_theirs(
     steps: int, offset_dn: float, theta: float
 ) -> None:
     """Of 0, 15 and 20 ms, at 20 ms between frames; also where pixels see other light."""
-    found = frame_exposure([(blurred(steps, theta, offset_dn), RUN)])
+    found, late, _ = frame_timing([(blurred(steps, theta, offset_dn), RUN)])
+    assert late == ON_TIME
     if steps:
         assert found.seconds == pytest.approx(1e-6 * steps * STEP_US, abs=1e-3)
         assert 2e-3 < found.std_s < 4e-3
@@ -70,11 +85,59 @@ def test_the_length_that_explains_the_frames_is_theirs(
         assert found.seconds == 0
 
 
-def test_a_delay_beyond_the_search_is_no_exposure() -> None:
-    """Of frames on another clock, 12 ms late: an exposure of 17 ms seemed to explain them."""
+@pytest.mark.parametrize("steps", [0, 12])
+@pytest.mark.parametrize("late_ms", [-12.0, -3.0, 5.0, 12.0])
+def test_wrong_frame_times_show(steps: int, late_ms: float) -> None:
+    """Events that come after the frames, and before; whatever the exposure, told or not."""
+    recording = moved(blurred(steps), -late_ms)
+    for told in (0.0, 1.25 * steps):
+        found = frame_timing([(dataclasses.replace(recording, exposure_us=round(1e3 * told)), RUN)])
+        assert 1e3 * found.late.seconds == pytest.approx(late_ms, abs=0.4)
+        assert 7e-4 <= found.late.std_s < 9e-4
+        assert bool(found.late.exposed_s) == (late_ms > 0 and not told)
+        assert bool(found.exposure.seconds) == (steps > 0 and not told)
+
+
+@pytest.mark.parametrize("tau_s", [3e-3, 6e-3])
+def test_slow_pixels_are_not_late(tau_s: float) -> None:
+    """They blur the events as much as they delay them; beside wrong times they do not."""
+    recording = blurred(0, tau_s=tau_s)
+    found = frame_timing([(recording, RUN)])
+    assert found[:2] == UNTIMED[:2]
+    assert found.delay_s == pytest.approx(tau_s, abs=1.5e-3)
+    for ms in (-12.0, 6.0):
+        late = frame_timing([(moved(recording, -ms), RUN)]).late
+        assert 1e3 * late.seconds == pytest.approx(ms + 1e3 * tau_s, abs=1.5)
+
+
+def test_slow_pixels_before_frames_that_are_exposed_are_told_beside_the_delay() -> None:
+    """To second order, both are the same as wrong frame times."""
+    late = frame_timing([(blurred(16, tau_s=5e-3), RUN)]).late
+    assert late.seconds == pytest.approx(5e-3, abs=1e-3)
+    assert late.exposed_s == pytest.approx(20e-3, abs=3e-3)
+
+
+@pytest.mark.parametrize("ms", [19.0, 30.0, -60.0])
+def test_a_delay_beyond_the_search_says_nothing(ms: float) -> None:
+    """Of frames on another clock."""
+    assert frame_timing([(moved(blurred(0), ms), RUN)]) == UNTIMED
+
+
+def test_frames_that_come_fast_tell_their_clock_too() -> None:
+    """At 10 ms from frame to frame, without an exposure."""
+    recording = moved(blurred(0, theta=0.05, every=STEPS // 2), 3.0)
+    found = frame_timing([(recording, RUN)])
+    assert found.late.seconds == pytest.approx(-3e-3, abs=4e-4)
+    assert found.exposure == UNSEEN
+
+
+def test_the_times_of_frames_are_aligned() -> None:
     recording = blurred(0)
-    late = dataclasses.replace(recording, frame_times=recording.frame_times + 12_000)
-    assert frame_exposure([(late, RUN)]) == UNSEEN
+    assert aligned(recording) is recording
+    for ms in (-35.0, -8.0, 5.0):
+        found = aligned(moved(recording, -ms))
+        assert found.frame_times[0] - recording.frame_times[0] == pytest.approx(0.0, abs=400.0)
+        assert [note.code for note in found.notes] == ["frames.moved"]
 
 
 def test_a_single_place_says_nothing() -> None:
@@ -84,18 +147,18 @@ def test_a_single_place_says_nothing() -> None:
     corner = (events.x < 8) & (events.y < 8)
     one = dataclasses.replace(recording, events=Events(
         *(getattr(events, name)[corner] for name in "xytp"), events.size))
-    assert frame_exposure([(one, RUN)]) == UNSEEN
-    assert frame_exposure([(one, RUN)] * 4) != UNSEEN  # as if of four tiles
+    assert frame_timing([(one, RUN)]) == UNTIMED
+    assert frame_timing([(one, RUN)] * 4) != UNTIMED  # as if of four tiles
 
 
 def test_events_that_are_left_out_have_no_part(monkeypatch: pytest.MonkeyPatch) -> None:
     place = blurred(12, theta=0.15), RUN
-    monkeypatch.setattr(frame_exposure_module, "MOST", 1500)
-    found, used = frame_exposure([place]), []
+    monkeypatch.setattr(frame_timing_module, "MOST", 1500)
+    found, used = frame_timing([place]), []
     near = between_events._near
     monkeypatch.setattr(between_events, "_near", lambda *a: (
         used.append(len(near(*a)) / len(a[-2])), np.arange(len(a[-2])))[1])
-    assert frame_exposure([place]) == found != UNSEEN
+    assert frame_timing([place]) == found != UNTIMED
     assert used[0] < 0.9
 
 
@@ -105,12 +168,12 @@ def test_every_event_twice_can_be_solved() -> None:
     events = recording.events
     twice = Events(*(np.repeat(getattr(events, name), 2) for name in "xyt"),
                    np.tile([True, False], len(events)), events.size)
-    assert frame_exposure([(dataclasses.replace(recording, events=twice), RUN)]) == UNSEEN
+    assert frame_timing([(dataclasses.replace(recording, events=twice), RUN)]) == UNTIMED
 
 
 def test_where_little_happens_between_frames_it_stays_unknown() -> None:
     for theta in (0.8, 1.5):  # too few changes, and none
-        assert frame_exposure([(blurred(12, theta=theta), RUN)]) == UNSEEN
+        assert frame_timing([(blurred(12, theta=theta), RUN)]) == UNTIMED
 
 
 def test_one_polarity_alone_and_frames_that_stay_say_nothing() -> None:
@@ -120,7 +183,7 @@ def test_one_polarity_alone_and_frames_that_stay_say_nothing() -> None:
         events.x[on], events.y[on], events.t[on], on[on], events.size))
     still = dataclasses.replace(recording, frames=np.full_like(recording.frames, 90))
     for one in (rising, still):
-        assert frame_exposure([(one, RUN)]).seconds == 0
+        assert frame_timing([(one, RUN)]) == UNTIMED
 
 
 def test_what_is_told_is_not_measured() -> None:
@@ -130,7 +193,7 @@ def test_what_is_told_is_not_measured() -> None:
     assert is_untold(recording)
     for told in (dataclasses.replace(recording, exposure_us=5000), left, made):
         assert not is_untold(told)
-        assert frame_exposure([(told, RUN)]) == UNSEEN
+        assert frame_timing([(told, RUN)])[:2] == UNTIMED[:2]
     assert is_untold(dataclasses.replace(left, notes=adjust.exposed(left, 5.0).notes))
     assert [note.code for note in left.notes] == ["frames.blur"]
 
@@ -170,9 +233,9 @@ def test_an_estimate_takes_the_blur_out_and_says_so(tmp_path: Path) -> None:
 def test_events_that_wait_are_not_taken_for_a_blur(monkeypatch: pytest.MonkeyPatch) -> None:
     recording = blurred(12)
     stretches = cut(recording, plan_windows(recording))
-    assert front_end.find_exposure(stretches, measured=True).seconds > 0.01
+    assert front_end.find_timing(stretches, measured=True).exposure.seconds > 0.01
     monkeypatch.setattr(front_end, "dead_time", lambda _: DeadTime(5e-3, 1e-4))
-    assert front_end.find_exposure(stretches, measured=True) == UNSEEN
+    assert front_end.find_timing(stretches, measured=True) == UNTIMED
 
 
 def test_of_a_real_camera_it_is_what_its_file_says(data_file: Callable[[str], Path]) -> None:
@@ -182,5 +245,6 @@ def test_of_a_real_camera_it_is_what_its_file_says(data_file: Callable[[str], Pa
     assert cradle.exposure_us == 20_000
     untold = dataclasses.replace(cradle, exposure_us=0)
     runs = [s.run for s in cut(untold, plan_windows(untold))]
-    found = frame_exposure([(untold, run) for run in runs])
+    found, late, _ = frame_timing([(untold, run) for run in runs])
     assert abs(found.seconds - 0.02) < 2 * found.std_s
+    assert late == ON_TIME
