@@ -36,6 +36,11 @@ PIXEL, SPIKES, NOISE = "simulator/pixel.py", "simulator/spikes.py", "simulator/n
 OBJECTIVE, STEP = "training/objective.py", "training/step.py"
 FLOW, VOXEL, SIMULATE = "tests/network/test_flow.py", "tests/test_voxel.py", "tests/simulator/"
 MUTATIONS = (
+    Mutation("own instruments", "estimation/refine/frame_timing.py",
+             "changes(run.around, over, delay_us).mean(1)", "changes(run.own, over, delay_us)",
+             "tests/estimation/refine/test_frame_timing.py -k residuals"),
+    Mutation("no arcs", "estimation/refine/between_events.py", "ARC = 3.7 ", "ARC = 0.0 ",
+             "tests/estimation/refine/test_frame_timing.py -k length"),
     Mutation("log-det", "network/flow/stack.py",
              "return h, log_det + jnp.sum(s)\n", "return h, 0.99 * (log_det + jnp.sum(s))\n",
              f"{FLOW} -k jacobian"),

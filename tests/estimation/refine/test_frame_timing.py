@@ -64,6 +64,12 @@ def blurred(
                      np.round(middle * STEP_US).astype(np.int64))
 
 
+@pytest.fixture(autouse=True)
+def few_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A part of them suffices here."""
+    monkeypatch.setattr(frame_timing_module, "MOST", 1500)
+
+
 def moved(recording: Recording, ms: float) -> Recording:
     """With other frame times."""
     times = recording.frame_times + round(1e3 * ms)
@@ -153,13 +159,26 @@ def test_a_single_place_says_nothing() -> None:
 
 def test_events_that_are_left_out_have_no_part(monkeypatch: pytest.MonkeyPatch) -> None:
     place = blurred(12, theta=0.15), RUN
-    monkeypatch.setattr(frame_timing_module, "MOST", 1500)
     found, used = frame_timing([place]), []
     near = between_events._near
     monkeypatch.setattr(between_events, "_near", lambda *a: (
         used.append(len(near(*a)) / len(a[-2])), np.arange(len(a[-2])))[1])
     assert frame_timing([place]) == found != UNTIMED
     assert used[0] < 0.9
+
+
+def test_residuals_are_compared_with_what_neighbours_show_alone() -> None:
+    """A pixel's own counts share the rounding of its residuals. Here no neighbour fires."""
+    recording = blurred(0)
+    events = recording.events
+    apart = (events.x % 3 == 1) & (events.y % 3 == 1)
+    lonely = dataclasses.replace(recording, events=Events(
+        *(getattr(events, name)[apart] for name in "xytp"), events.size))
+    run = frame_timing_module._busy(lonely, RUN, np.random.default_rng(0))
+    products = frame_timing_module._products([run], [(500.0, 0.0)], 0.0, 0.0)
+    assert len(run.block) > 100
+    assert (products[..., :4, :] == 0).all()
+    assert (products[..., 4:, 4:].sum((0, 1, 2)) != 0).all()
 
 
 def test_every_event_twice_can_be_solved() -> None:
