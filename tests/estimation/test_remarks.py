@@ -9,8 +9,10 @@ from evflow.camera import Summary
 from evflow.camera.optics import Optics
 from evflow.camera.sensors import LogMap
 from evflow.estimation.refine import Found
+from evflow.estimation.refine.frame_exposure import UNSEEN, Exposure, Late
+from evflow.estimation.refine.frame_timing import UNTIMED, Timing
 from evflow.estimation.refine.receptor_result import OtherMap
-from evflow.estimation.remarks import receptor_notes
+from evflow.estimation.remarks import receptor_notes, timing_notes
 from evflow.simulator.photoreceptor import Photoreceptor
 
 SUMMARY = Summary(*(np.float32(v) for v in (0.2, 0.25, 0.1, 0.1, 0.03, 0.03)))
@@ -19,14 +21,14 @@ STD = Summary(*(np.float32(v) for v in (0.01, 0.0125, 0.03, 0.04, 0.005, 0.006))
 
 def told(
     offset_dn: float, std_dn: float, due: float, log_map: LogMap = "linlog",
-    other: OtherMap | None = None, delay_s: float = 0.0,
+    other: OtherMap | None = None,
 ) -> dict[str, str]:
     """The notes, by code, where the constants' errors alone change theta by the share `due`."""
     seen = Photoreceptor(offset_dn, log_map=log_map)
     found = Found(
         seen, np.full(2, 0.3), np.full(2, 0.3), np.diag([std_dn**2, 1e-8, 1e-8]), np.full(2, due),
         (0.9, 0.9), 0.1, 0.0, 400.0, np.zeros((2, 3)), np.zeros((2, 2)), other)
-    optics = Optics(offset_dn, delay_s, std_dn, 1e-4)
+    optics = Optics(offset_dn, 0.0, std_dn, 1e-4)
     return {note.code: note.text
             for note in receptor_notes(found, optics, SUMMARY, STD, sought=True)}
 
@@ -62,10 +64,23 @@ def test_a_logarithm_that_the_light_leaves_open_is_told(chance: float, told_so: 
 
 @pytest.mark.parametrize(("delay_s", "way"), [(4e-3, "after"), (-4e-3, "before"), (2e-3, "")])
 def test_frame_times_that_disagree_with_the_events_are_told(delay_s: float, way: str) -> None:
-    notes = told(0.0, 1.0, 0.01, delay_s=delay_s)
-    assert ("frames.delay" in notes) == bool(way)
+    notes = timing_notes(UNTIMED, Optics(0.0, delay_s, 1.0, 1e-4))
+    assert [note.code for note in notes] == ["frames.delay"] * bool(way)
     if way:
-        assert f"4.0 ms {way} frames" in notes["frames.delay"]
+        assert f"4.0 ms {way} frames" in notes[0].text
+
+
+@pytest.mark.parametrize("exposed_s", [0.0, 0.018])
+def test_what_frame_times_are_wrong_by_is_told_and_stands_first(exposed_s: float) -> None:
+    """With the option that takes it out, and what else may be the cause."""
+    timing = Timing(Exposure(0.02, 0.003), Late(7.8e-3, 7e-4, exposed_s), 7.8e-3)
+    delay, exposure = timing_notes(timing, Optics(0.0, 4e-3, 1.0, 1e-4))
+    assert "7.8 ± 0.7 ms after frames" in delay.text
+    assert "--frames-offset-ms 7.8, or auto" in delay.text
+    assert ("18 ms before slow pixels" in delay.text) == bool(exposed_s)
+    assert exposure.code == "frames.exposure"
+    assert "20 ± 3 ms" in exposure.text
+    assert timing_notes(Timing(UNSEEN), None) == []
 
 
 @pytest.mark.parametrize("sought", [True, False])

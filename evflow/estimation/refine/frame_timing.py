@@ -11,7 +11,7 @@ from event to event is cut where it turns: there it is an arc.
 
 Slow pixels delay events too, but they also blur them: to second order, a low-pass of time constant
 tau has a delay of tau and takes 12 tau^2 off the square of the length. And most are slower in the
-dark. So wrong frame times show.
+dark. So wrong frame times show, where neither is so.
 """
 
 from __future__ import annotations
@@ -45,9 +45,10 @@ DELAYS_US = 1e3 * np.arange(-18.0, 19.0, 2.0)  # of events after frames: slow pi
 REACH_US = 0.5 * LENGTHS_US[-1] - DELAYS_US[0], 0.5 * LENGTHS_US[-1] + DELAYS_US[-1]
 OFFSETS = (-16.0, -8.0, 0.0, 8.0, 16.0, 26.0, 40.0)  # DN
 BEYOND = 1.3  # times the interval between frames, so that an exposure as long as that is inside
-BUSY = 4.0  # events between two frames: of fewer the interpolated signal looks smooth itself
+BUSY = 2.0  # events between two frames: of fewer the interpolated signal looks smooth itself
 MOST, ENOUGH = 5_000, 150  # changes used of a run; in all
-CLEARLY, BIAS = 3.0, 60e6  # std of the square of the length that are none; its error in a scene
+CLEARLY, BIAS = 3.0, 70e6  # std of the square of the length that are none; its error in a scene
+EXPLAINS = 4.0  # times the least misfit, which that of no exposure exceeds if one is seen
 LEAST = np.log(0.7)  # log of the unexplained share, at most: else it is another scene or clock
 UNEQUAL = 0.05  # of a threshold, below which the other polarity foretells nothing
 NOTHING = 1e-9  # of the sums, so that one polarity alone, or no change, can be solved
@@ -55,8 +56,9 @@ FEWEST, FEWEST_LENGTHS = 4, 3  # tiles, over which a length's scatter says somet
 FLOOR_S = 2.5e-3  # std beside the scatter, of simulated cameras exposed for 10 and 20 ms
 LATE_STD_US = 700.0  # std beside the scatter, of a delay
 SLOWEST_US = 4000.0  # delay up to which slow pixels before frames of untold exposure are likelier
+DARK_STD_US = 300.0  # std beside the scatter, of how much longer the delay is in the dark
+KNEE = 20.0  # DN, of a photoreceptor whose rate is proportional to light and this
 PARTLY = 0.2  # of what pixels as slow take off, from which a part of the delay is theirs
-DARKER = 0.1  # of the delay, by which that of the darker half is longer before slow pixels
 SLOW = 12.0  # square of the length over that of the delay, of a low-pass of first order
 
 
@@ -115,14 +117,17 @@ def frame_timing(places: Sequence[Place]) -> Timing:
         of_delays = products[:len(at), ..., 4:, 4:].sum(1)
         dark, bright = (_delay(at, of_delays[:, k]) for k in (0, 1))
         return np.array([_delay(at, of_delays.sum(1)), dark - bright,
-                         _square(lengths, products[len(at):].sum((1, 2)))])
+                         _lowest(*_misfits(lengths, products[len(at):].sum((1, 2))))])
 
     best = measured(table)
     without = [measured(np.delete(table, b, 1)) for b in used]
     error = np.sqrt((len(used) - 1) * np.var(without, 0))
     late_us, by_light, square = zip(best.tolist(), error.tolist(), strict=True)
-    seen = square[0] < lengths[-1]**2 and untold
-    late = _late(late_us, by_light, (square[0] - told_us**2, square[1]), untold=untold)
+    misfits = _misfits(lengths, table[len(at):].sum((1, 2)))[1]
+    explained = misfits[len(SHARPER)] > EXPLAINS * misfits.min()
+    seen = square[0] < lengths[-1]**2 and untold and explained
+    longer = (_longer_in_the_dark(runs) * late_us[0] - by_light[0], by_light[1])
+    late = _late(late_us, longer, (square[0] - told_us**2, square[1]), untold=untold)
     return Timing(_exposure(*square, interval) if seen else UNSEEN, late, 1e-6 * late_us[0])
 
 
@@ -135,12 +140,22 @@ def _exposure(square: float, error: float, interval_us: float) -> Exposure:
                     float(np.hypot(5e-7 * error / length, FLOOR_S)))
 
 
+def _longer_in_the_dark(runs: Sequence[Busy]) -> float:
+    """By which share of their delay slow pixels are later in the darker half than in the other."""
+    dn = np.concatenate([0.5 * (run.before + run.after) for run in runs])
+    bright = np.concatenate([run.block % 2 == 1 for run in runs])
+    if bright.all() or not bright.any():
+        return 0.0
+    times = [1.0 / (float(dn[half].mean()) + KNEE) for half in (~bright, bright)]
+    return 2.0 * (times[0] - times[1]) / (times[0] + times[1])
+
+
 def _late(
-    delay_us: tuple[float, float], by_light_us: tuple[float, float], square: tuple[float, float], *,
+    delay_us: tuple[float, float], missing_us: tuple[float, float], square: tuple[float, float], *,
     untold: bool,
 ) -> Late:
     """Events that are late by this, of values and their errors; not if they are blurred, or later
-    in the dark, as those of slow pixels. by_light_us: how much later they are in the dark."""
+    in the dark, as those of slow pixels. missing_us: how much later these would be in the dark."""
     late_us, std_us = delay_us[0], float(np.hypot(delay_us[1], LATE_STD_US))
     error = float(np.hypot(square[1], BIAS))
     taken = SLOW * late_us**2  # off the square, by pixels that are as slow
@@ -153,7 +168,7 @@ def _late(
         return ON_TIME
     if more <= CLEARLY * error or square[0] <= -PARTLY * taken:
         return ON_TIME
-    if by_light_us[0] > DARKER * late_us + by_light_us[1]:
+    if missing_us[0] <= CLEARLY * float(np.hypot(missing_us[1], DARK_STD_US)):
         return ON_TIME
     return Late(1e-6 * late_us, 1e-6 * std_us, 1e-6 * more**0.5 * untold)
 
@@ -252,9 +267,9 @@ def _delay(delays: Array, total: Array) -> float:
     return _lowest(delays, -explained)
 
 
-def _square(lengths: Array, total: Array) -> float:
-    """The square of the length whose residuals have least to do with what neighbours show, by a
-    parabola; below none, where it is linear in the square, too."""
+def _misfits(lengths: Array, total: Array) -> tuple[Array, Array]:
+    """Squares of lengths, and how much the residuals of each have to do with what neighbours show:
+    also of SHARPER, to which all is continued as it is linear in the square."""
     squares = np.concatenate([SHARPER, lengths**2])
     k = min(2, len(lengths) - 1)  # a length that differs from none beyond rounding
     bend = (total[k] - total[0]) / (lengths[k]**2 - lengths[0]**2)
@@ -266,7 +281,7 @@ def _square(lengths: Array, total: Array) -> float:
     theta = np.linalg.solve(weighted @ counts + NOTHING * np.eye(2), weighted @ frames)
     left = frames - counts @ theta
     misfit = (np.swapaxes(left, -1, -2) @ weight @ left)[:, 0, 0]
-    return _lowest(squares, misfit)
+    return squares, misfit
 
 
 def _lowest(at: Array, values: Array) -> float:
