@@ -57,6 +57,7 @@ FLOOR_S = 2.5e-3  # std beside the scatter, of simulated cameras exposed for 10 
 LATE_STD_US = 700.0  # std beside the scatter, of a delay
 SLOWEST_US = 4000.0  # delay up to which slow pixels before frames of untold exposure are likelier
 DARK_STD_US = 300.0  # std beside the scatter, of how much longer the delay is in the dark
+DIM = 20.0  # DN, pixels' mean up to which cameras' logarithms differ, and whole DN are steps
 KNEE = 20.0  # DN, of a photoreceptor whose rate is proportional to light and this
 PARTLY = 0.2  # of what pixels as slow take off, from which a part of the delay is theirs
 SLOW = 12.0  # square of the length over that of the delay, of a low-pass of first order
@@ -182,6 +183,7 @@ def _busy(recording: Recording, run: Sequence[int], rng: np.random.Generator) ->
     pixel, at = events.y.astype(np.int64) * width + events.x, events.t.astype(np.float64)
     number = _smooth_numbers(times, at, pixel, height * width)
     shown = np.stack([glitches.exposed(frame) for frame in frames])
+    shown &= frames.mean(0) > DIM
     shown[:, [0, -1]] = shown[:, :, [0, -1]] = False  # they lack a neighbour
     shown = shown.reshape(len(frames), -1)
     where = np.flatnonzero((shown[1:] & shown[:-1]).ravel() & (number > BUSY))
