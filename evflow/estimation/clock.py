@@ -14,8 +14,8 @@ from evflow.types import Recording
 def aligned(recording: Recording) -> Recording:
     """The recording, its frame times shifted so that frames and events agree.
 
-    To a fraction of a millisecond where the frames' changes are those of the counts, by less than
-    18 ms and if slow pixels do not explain it (`frame_timing`). Else by more than half an interval
+    To a fraction of a millisecond where the frames' changes are those of the counts, by up to
+    14 ms and if slow pixels do not explain it (`frame_timing`). Else by more than half an interval
     between frames, where changes of the frames and numbers of events agree best (`frames_offset`).
 
     Args:

@@ -2,7 +2,8 @@
 
     recording --> stretches, read one after the other    stretches.py
     events --> signals between them                      between_events.py
-    these + frames --> exposure and clock of the frames   frame_timing.py
+    these, where much happens                            busy.py
+    these + frames --> exposure and clock of the frames  frame_timing.py
     frames --optical flow--> path (fine log frames)      path.py
     path + recorded events --> Chunk                     chunk.py
     recorded events, simulated events --> Trace          trace.py

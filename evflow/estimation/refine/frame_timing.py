@@ -21,7 +21,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evflow.estimation.refine.between_events import SPAN_US, Signals, changes, signals_of
+from evflow.estimation.refine.between_events import changes
+from evflow.estimation.refine.busy import Busy, busy
 from evflow.estimation.refine.frame_exposure import (
     ON_TIME,
     UNSEEN,
@@ -32,8 +33,7 @@ from evflow.estimation.refine.frame_exposure import (
 from evflow.estimation.refine.path import Place
 from evflow.estimation.refine.receptor_data import TILES
 from evflow.light.log_maps import log64
-from evflow.recordings import glitches
-from evflow.types import Recording, release
+from evflow.types import release
 
 Array = np.ndarray
 
@@ -45,8 +45,7 @@ DELAYS_US = 1e3 * np.arange(-18.0, 19.0, 2.0)  # of events after frames: slow pi
 REACH_US = 0.5 * LENGTHS_US[-1] - DELAYS_US[0], 0.5 * LENGTHS_US[-1] + DELAYS_US[-1]
 OFFSETS = (-16.0, -8.0, 0.0, 8.0, 16.0, 26.0, 40.0)  # DN
 BEYOND = 1.3  # times the interval between frames, so that an exposure as long as that is inside
-BUSY = 2.0  # events between two frames: of fewer the interpolated signal looks smooth itself
-MOST, ENOUGH = 5_000, 150  # changes used of a run; in all
+ENOUGH = 150  # changes
 CLEARLY, BIAS = 3.0, 70e6  # std of the square of the length that are none; its error in a scene
 EXPLAINS = 4.0  # times the least misfit, which that of no exposure exceeds if one is seen
 LEAST = np.log(0.7)  # log of the unexplained share, at most: else it is another scene or clock
@@ -57,21 +56,9 @@ FLOOR_S = 2.5e-3  # std beside the scatter, of simulated cameras exposed for 10 
 LATE_STD_US = 700.0  # std beside the scatter, of a delay
 SLOWEST_US = 4000.0  # delay up to which slow pixels before frames of untold exposure are likelier
 DARK_STD_US = 300.0  # std beside the scatter, of how much longer the delay is in the dark
-DIM = 20.0  # DN, pixels' mean up to which cameras' logarithms differ, and whole DN are steps
 KNEE = 20.0  # DN, of a photoreceptor whose rate is proportional to light and this
 PARTLY = 0.2  # of what pixels as slow take off, from which a part of the delay is theirs
 SLOW = 12.0  # square of the length over that of the delay, of a low-pass of first order
-
-
-class Busy(NamedTuple):
-    """Where much happens between two frames of a run. own: of those pixels; around: of their four
-    neighbours. Changes (M,): before, after, DN; block, of the image, twice: dark and bright."""
-
-    own: Signals
-    around: Signals
-    before: Array
-    after: Array
-    block: Array
 
 
 class Timing(NamedTuple):
@@ -91,7 +78,7 @@ def frame_timing(places: Sequence[Place]) -> Timing:
     if any(recording.frames_were_made for recording, _ in places):
         return UNTIMED
     rng = np.random.default_rng(0)
-    runs = [_busy(recording, run, rng) for recording, run in places]
+    runs = [busy(recording, run, REACH_US, rng) for recording, run in places]
     told_us = float(np.mean([recording.exposure_us for recording, _ in places]))
     untold = all(is_untold(recording) for recording, _ in places)
     for recording, _ in places:
@@ -103,7 +90,8 @@ def frame_timing(places: Sequence[Place]) -> Timing:
     if len(lengths) < FEWEST_LENGTHS:
         return UNTIMED
     middle = min(MIDDLE_US, lengths[-1])
-    logs = np.stack([_unexplained(runs, middle, delay) for delay in DELAYS_US])
+    of_frames = np.stack([np.concatenate([_of_frames(run, o) for run in runs]) for o in OFFSETS])
+    logs = np.stack([_unexplained(runs, of_frames, middle, delay) for delay in DELAYS_US])
     delay, offset = (int(k) for k in np.unravel_index(np.argmin(logs), logs.shape))
     if delay in (0, 1, len(DELAYS_US) - 2, len(DELAYS_US) - 1) or logs.min() > LEAST:
         return UNTIMED
@@ -174,48 +162,6 @@ def _late(
     return Late(1e-6 * late_us, 1e-6 * std_us, 1e-6 * more**0.5 * untold)
 
 
-def _busy(recording: Recording, run: Sequence[int], rng: np.random.Generator) -> Busy:
-    """Of a run of frame intervals, at most MOST changes."""
-    frames = np.stack([recording.frame_dn(i) for i in [*run, run[-1] + 1]])
-    times = recording.frame_times[run[0]:run[-1] + 2].astype(np.float64)
-    height, width = frames.shape[1:]
-    events = recording.events.slice(int(times[0] - SPAN_US), int(times[-1] + SPAN_US))
-    pixel, at = events.y.astype(np.int64) * width + events.x, events.t.astype(np.float64)
-    number = _smooth_numbers(times, at, pixel, height * width)
-    shown = np.stack([glitches.exposed(frame) for frame in frames])
-    shown &= frames.mean(0) > DIM
-    shown[:, [0, -1]] = shown[:, :, [0, -1]] = False  # they lack a neighbour
-    shown = shown.reshape(len(frames), -1)
-    where = np.flatnonzero((shown[1:] & shown[:-1]).ravel() & (number > BUSY))
-    if len(where) > MOST:
-        where = np.sort(rng.choice(where, MOST, replace=False))
-    interval, place = np.divmod(where, height * width)
-    around = place + np.array([-width, -1, 1, width])[:, None]
-    order = np.argsort(pixel, kind="stable")
-    sent = pixel[order], events.p[order], at[order]
-    light = frames.reshape(len(frames), -1)
-    y, x = place // width * TILES[0] // height, place % width * TILES[1] // width
-    before, after = light[:-1][interval, place], light[1:][interval, place]
-    middle = np.median(before + after) if len(before) else 0.0
-    return Busy(signals_of(times, interval, place, sent, REACH_US),
-                signals_of(times, interval, around, sent, REACH_US),
-                before, after, 2 * (y * TILES[1] + x) + (before + after > middle))
-
-
-def _smooth_numbers(times: Array, at: Array, pixel: Array, pixels: int) -> Array:
-    """(K * pixels) events between two frames, those near a frame shared with the interval beyond:
-    a choice by whole intervals would prefer events that are early or late in it."""
-    middles = 0.5 * (times[1:] + times[:-1])
-    place = np.interp(at, middles, np.arange(len(middles)), left=-1.0, right=-1.0)
-    inside = np.flatnonzero(place >= 0)
-    first = place[inside].astype(np.int64)
-    later = place[inside] - first
-    slot, size = first * pixels + pixel[inside], len(middles) * pixels
-    number = np.bincount(slot, 1.0 - later, size)
-    number[pixels:] += np.bincount(slot, later, size)[:-pixels]
-    return number
-
-
 def _of_frames(run: Busy, offset: float) -> Array:
     """(M,) changes of the log of the frames."""
     before, after = (log64(np.maximum(dn + offset, 0.0), "linlog")
@@ -223,10 +169,11 @@ def _of_frames(run: Busy, offset: float) -> Array:
     return after - before
 
 
-def _unexplained(runs: Sequence[Busy], length_us: float, delay_us: float) -> Array:
-    """(OFFSETS,) log of the share that least squares leave."""
+def _unexplained(
+    runs: Sequence[Busy], of_frames: Array, length_us: float, delay_us: float
+) -> Array:
+    """(OFFSETS,) log of the share that least squares leave of what frames show (OFFSETS, M)."""
     counts = np.concatenate([changes(run.own, length_us, delay_us) for run in runs], 1)
-    of_frames = np.stack([np.concatenate([_of_frames(run, o) for run in runs]) for o in OFFSETS])
     on_off = counts @ counts.T
     size = NOTHING * (1.0 + np.trace(on_off))
     both = of_frames @ counts.T

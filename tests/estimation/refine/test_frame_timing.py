@@ -16,7 +16,7 @@ from evflow.camera.optics import read_sensor
 from evflow.estimation import front_end
 from evflow.estimation.clock import aligned
 from evflow.estimation.dead_time import DeadTime
-from evflow.estimation.refine import between_events
+from evflow.estimation.refine import between_events, busy
 from evflow.estimation.refine import frame_timing as frame_timing_module
 from evflow.estimation.refine.frame_exposure import (
     ON_TIME,
@@ -67,7 +67,7 @@ def blurred(
 @pytest.fixture(autouse=True)
 def few_changes(monkeypatch: pytest.MonkeyPatch) -> None:
     """A part of them suffices here."""
-    monkeypatch.setattr(frame_timing_module, "MOST", 1500)
+    monkeypatch.setattr(busy, "MOST", 1500)
 
 
 def moved(recording: Recording, ms: float) -> Recording:
@@ -174,7 +174,7 @@ def test_residuals_are_compared_with_what_neighbours_show_alone() -> None:
     apart = (events.x % 3 == 1) & (events.y % 3 == 1)
     lonely = dataclasses.replace(recording, events=Events(
         *(getattr(events, name)[apart] for name in "xytp"), events.size))
-    run = frame_timing_module._busy(lonely, RUN, np.random.default_rng(0))
+    run = busy.busy(lonely, RUN, frame_timing_module.REACH_US, np.random.default_rng(0))
     products = frame_timing_module._products([run], [(500.0, 0.0)], 0.0, 0.0)
     assert len(run.block) > 100
     assert (products[..., :4, :] == 0).all()
