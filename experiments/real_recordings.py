@@ -6,10 +6,10 @@
 Of each recording, with the photoreceptor measured, with an ideal pixel in its place, and with the
 maps of the first alone, without its low-pass and the light added: theta, that light, and the
 busiest part re-simulated from its own frames, as the report of `evflow estimate` does (correlation
-of the pixels' counts, of signed events in cubes of 2 ms and 3x3 pixels, and events over those
-recorded), and the share of the brightness at the events of the second half that the constants of
-the first explain. True thresholds of these cameras are unknown. debug: the
-first recording. Writes real_recordings.json, .md and a picture of each.
+of the pixels' counts, of signed events in cubes of 2 ms and 3x3 pixels, each beside the one that
+would be seen if all were true, and events over those recorded), and the share of the brightness at
+the events of the second half that the constants of the first explain. True thresholds of these
+cameras are unknown. debug: the first recording. Writes real_recordings.json, .md and pictures.
 """
 
 from __future__ import annotations
@@ -65,19 +65,20 @@ def measured(
         ("", found.summary), ("std_", found.summary_std)) for side in SIDES}
     return {**theta, "offset_dn": found.optics.offset_dn, "offset_std": found.optics.offset_dn_std,
             "cutoff_hz": found.sensor.cutoff_hz, "by_light": found.sensor.cutoff_by_light,
-            "r": numbers["counts"]["r"], "ceiling": trial.ceiling,
-            "space_time_r": numbers["space_time_r"], "events": numbers["rate_hz"]["ratio"],
+            "r": numbers["counts"]["r"], "space_time_r": numbers["space_time_r"],
+            "ceiling": trial.ceiling, "events": numbers["rate_hz"]["ratio"],
             "explained": explained}, trial
 
 
 def cells(name: str, pixel: str, row: dict[str, Any]) -> list[str]:
-    """Of the table."""
+    most = row["ceiling"]
     theta = " / ".join(f"{row[f'theta_{s}']:.3f} ± {row[f'std_theta_{s}']:.3f}" for s in SIDES)
     cutoff = f"{row['cutoff_hz']:.0f} Hz" + " in any light" * (not row["by_light"])
-    return [name, pixel, theta,
-            f"{row['offset_dn']:.0f} ± {row['offset_std']:.0f} DN" if pixel == "measured" else "",
-            cutoff if row["cutoff_hz"] else "", " / ".join(f"{row['r'][s]:.3f}" for s in SIDES),
-            f"{row['space_time_r']:.3f}", " / ".join(f"{row['events'][s]:.2f}" for s in SIDES),
+    light = f"{row['offset_dn']:.0f} ± {row['offset_std']:.0f} DN" if pixel == "measured" else ""
+    return [name, pixel, theta, light, cutoff if row["cutoff_hz"] else "",
+            " / ".join(f"{row['r'][s]:.3f} of {most[s]:.3f}" for s in SIDES),
+            f"{row['space_time_r']:.3f} of {most['space_time_r']:.3f}",
+            " / ".join(f"{row['events'][s]:.2f}" for s in SIDES),
             "" if row["explained"] is None else f"{row['explained']:.3f}"]
 
 

@@ -108,8 +108,8 @@ def write_report(
     Returns:
         JSON-ready numbers, also stored in the page: "grade" ("good", "fair", "poor"), "verdict"
         (what was seen and what to do, one sentence each), "trial" and "held_out" (each None, or the
-        result of `compare`, with the "ceiling" of the counts' r); "simulators" if they were tested,
-        the nearest first, and "nearest", a sentence on them.
+        result of `compare`, with the "ceiling" of its correlations); "simulators" if they were
+        tested, the nearest first, and "nearest", a sentence on them.
 
     Raises:
         EvflowDataError: EV010 (matplotlib is missing), EV013 (exists), EV015 (a recording of

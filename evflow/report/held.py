@@ -5,7 +5,7 @@ from __future__ import annotations
 from evflow.estimation.result import CameraEstimate
 from evflow.report.page import Panel, number, paragraph, plural, spread, table
 from evflow.report.resimulate import Trial
-from evflow.report.streams import Names
+from evflow.report.streams import Names, ceiling_row
 
 NAMES: Names = ("recorded", "re-simulated")
 
@@ -28,8 +28,7 @@ def held_panel(
                                   ("eta_on", "η ON [Hz]"), ("eta_off", "η OFF [Hz]"))]
     counts = [["r, recorded against re-simulated", *(number(r[k], 3)
                                                      for k in ("on", "off", "both"))],
-              ["r of two re-simulations, the ceiling", *(number(held.ceiling[k], 3)
-                                                         for k in ("on", "off", "both"))]]
+              ceiling_row(held.ceiling)]
     return Panel("held-out", title, paragraph(
         "The longest stretch without a gap is divided near its middle. The camera was estimated "
         f"from {plural(half.windows, 'window')} of its first part only; of the second, "

@@ -1,8 +1,10 @@
 """Validation of an estimate: the recording's own frames, simulated with the estimated camera.
 
-A stretch of the recording is simulated twice, with two keys: the agreement of the two is the most
-that recording and simulation could reach. Work is bounded: the busiest seconds, and for the
-held-out half an estimate from the seconds before its middle. Host side.
+A stretch of the recording is simulated twice. One begins with pixels that remember the first frame,
+the other, with another key, with pixels that remember anything, as those of the camera may: if the
+estimate and the path were true, recording and simulation would agree as much as these two. Work is
+bounded: the busiest seconds, and for the held-out half an estimate from the seconds before its
+middle. Host side.
 """
 
 from __future__ import annotations
@@ -24,12 +26,14 @@ from evflow.estimation.refine.receptor_search import explained
 from evflow.estimation.refine.stretches import INTERVALS
 from evflow.estimation.refine.waiting import without_waiting
 from evflow.estimation.result import CameraEstimate
+from evflow.metrics.space_time import space_time_r
 from evflow.metrics.streams import compare, correlations
 from evflow.notes import Note
 from evflow.process.memory import give_back
 from evflow.recordings.bunches import beside, bunch
 from evflow.recordings.region import outside
 from evflow.recordings.windows import plan_windows
+from evflow.report.running import Picture, running
 from evflow.simulator import simulate_stream
 from evflow.simulator.interpolate import MIN_SIDE, Seen, notes_on, unzip, upsample
 from evflow.simulator.photoreceptor import as_measured, seen_frames
@@ -44,7 +48,6 @@ USUAL = 25  # interpolated pictures per frame, where much moves
 MOST_KEPT = 160_000_000  # bytes of pictures: half a second of a DAVIS346
 
 Run = tuple[int, int]  # first and last frame
-Picture = tuple[np.ndarray, int]  # (H, W) in DN, time in us
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -53,8 +56,8 @@ class Trial:
 
     real, made: their events over span_us = (t0, t1), which begins one frame after the simulation if
     there is room; frames: (first, last) of those simulated; numbers: `compare(real, made)`;
-    ceiling: correlation of the counts of two re-simulations, per polarity; instant_us: start of the
-    busiest 30 ms; notes: from the interpolation.
+    ceiling: the correlation of the counts of two re-simulations, per polarity, and their
+    "space_time_r"; instant_us: start of the busiest 30 ms; notes: from the interpolation.
     """
 
     real: Events
@@ -150,11 +153,11 @@ def resimulate(
     pictures: of the recording, if another part of it is simulated as well."""
     pictures = pictures or Pictures(recording)
     seen_by, model = as_measured(found.sensor, found.optics)
-    streams = [
-        simulate_stream(key, *unzip(shown), found.camera, model=model, full_scale=255)
-        for key, shown in zip(
-            jax.random.split(jax.random.key(seed)),
-            itertools.tee(seen_frames(pictures.of(run), seen_by)), strict=True)]
+    keys = jax.random.split(jax.random.key(seed))
+    shown, again_shown = itertools.tee(seen_frames(pictures.of(run), seen_by))
+    videos = shown, running(jax.random.fold_in(keys[1], 1), again_shown, found.camera)
+    streams = [simulate_stream(key, *unzip(video), found.camera, model=model, full_scale=255)
+               for key, video in zip(keys, videos, strict=True)]
     parts = list(zip(*streams, strict=True))  # in parallel, so that few frames are buffered
     begin = run[0] + 1 if run[1] - run[0] >= SETTLING else run[0]
     span = (int(recording.frame_times[begin]), int(recording.frame_times[run[1]]))
@@ -165,7 +168,8 @@ def resimulate(
     if disturbed is not None:
         real, made, again = (beside(e, recording.frame_times, disturbed)
                              for e in (real, made, again))
-    ceiling = correlations(*(e.count_map().astype(np.float64) for e in (made, again)))
+    ceiling = {**correlations(*(e.count_map().astype(np.float64) for e in (made, again))),
+               "space_time_r": space_time_r(made, again, *span)}
     del parts, again
     release(recording)
     give_back()

@@ -30,6 +30,7 @@ from evflow.recordings.region import outside
 from evflow.recordings.windows import iter_windows
 from evflow.report.page import Panel, number, paragraph, table
 from evflow.report.resimulate import LEARNT_SECONDS, Trial, usable_runs
+from evflow.report.running import running
 from evflow.simulator import simulate
 from evflow.simulator.interpolate import upsample
 from evflow.simulator.photoreceptor import IDEAL, Photoreceptor, as_measured, seen_frames
@@ -91,18 +92,14 @@ class Film:
     def simulated(
         self, key: jax.Array, camera: Camera, model: SensorModel, seen_by: Photoreceptor = IDEAL
     ) -> Events:
-        """Events of a camera in the span. Like a running camera's, its pixels' memories start
-        anywhere between the thresholds, by adjusting the first frame."""
+        """Events of a running camera in the span."""
         pairs = zip(self.frames, self.times_us.tolist(), strict=True)
-        frames, times = zip(*seen_frames(pairs, seen_by), strict=True)
-        video = np.stack(frames).astype(np.float32)
         added = {"voltmeter": model.voltmeter.k2, "esim": DARKEST}.get(model.kind, 0.0)
         k_memory, k_events = jax.random.split(key)
-        share = np.asarray(jax.random.uniform(k_memory, camera.shape))
-        both = np.asarray(camera.theta_on) + np.asarray(camera.theta_off)
-        memory = np.exp(np.asarray(camera.theta_off) - share * both)
-        video[0] = np.clip((video[0] + added) * memory - added, 0.0, 255.0)
-        events = simulate(k_events, video, np.array(times), camera, model=model, full_scale=255)
+        frames, times = zip(
+            *running(k_memory, seen_frames(pairs, seen_by), camera, added), strict=True)
+        events = simulate(k_events, np.stack(frames), np.array(times), camera, model=model,
+                          full_scale=255)
         return outside(events.slice(*self.span_us), self.hot)
 
 

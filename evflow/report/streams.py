@@ -67,8 +67,8 @@ def count_panel(
     keys = ("on", "off", "both")
     rows = [[f"r, {names[0]} against {names[1]}", *(number(r[k], 3) for k in keys)]]
     if ceiling:
-        rows.append(["r of two re-simulations, the ceiling", *(number(ceiling[k], 3)
-                                                               for k in keys)])
+        rows.append(ceiling_row(ceiling))
+    most = f" (two re-simulations: {number(ceiling['space_time_r'], 3)})" if ceiling else ""
     drawn = [figure(page.drawing(figures.counts(a, b, key, names), f"{key.upper()} per pixel"))
              for key, a, b in zip(("on", "off"), real.count_map(), made.count_map(), strict=True)]
     return Panel("counts", "Events per pixel", grid(drawn, 22) + paragraph(
@@ -79,7 +79,14 @@ def count_panel(
                     f"{active['synthetic']:.1%} in the {names[1]} one; of those that fire in "
                     f"either, {active['common'] or 0:.1%} fire in both. In space and time (ON "
                     "minus OFF events in cubes of 3×3 pixels and 2 ms): r = "
-                    f"{number(numbers['space_time_r'], 3)}.", "note"))
+                    f"{number(numbers['space_time_r'], 3)}{most}.", "note"))
+
+
+def ceiling_row(ceiling: dict[str, float | None]) -> list[str]:
+    """Of a table of correlations: those of two re-simulations, of which one begins with unknown
+    memories."""
+    return ["r of two re-simulations, the ceiling", *(number(ceiling[k], 3)
+                                                      for k in ("on", "off", "both"))]
 
 
 def time_panel(numbers: dict[str, Any], names: Names) -> Panel:
