@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from evflow.estimation.refine import plan_runs
 from evflow.estimation.refine.frame_timing import UNTIMED, Timing, frame_timing
 from evflow.estimation.refine.photoreceptor import receptor_places
 from evflow.recordings import adjust
 from evflow.recordings.check import frames_offset
+from evflow.recordings.dense import thinned
+from evflow.recordings.repeats import without_repeats
 from evflow.recordings.windows import plan_windows
 from evflow.types import Recording
+
+FARTHER_US = (24_000, -24_000, 48_000, -48_000)  # places to look around: `frame_timing` sees 14 ms
 
 
 def aligned(recording: Recording) -> Recording:
     """The recording, its frame times shifted so that frames and events agree.
 
-    To a fraction of a millisecond where the frames' changes are those of the counts, by up to
-    14 ms and if slow pixels do not explain it (`frame_timing`). Else by more than half an interval
-    between frames, where changes of the frames and numbers of events agree best (`frames_offset`).
+    To a fraction of a millisecond where the frames' changes are those of the counts, beside what
+    slow pixels explain (`frame_timing`): from 2 to 4 ms on, up to half an interval between frames.
+    Else by more than that, where changes of the frames and numbers of events agree best
+    (`frames_offset`).
 
     Args:
         recording: with frames.
@@ -24,12 +31,24 @@ def aligned(recording: Recording) -> Recording:
     Returns:
         The recording, with a note if it is shifted.
     """
-    if late_s := _timing(recording).late.seconds:
-        return adjust.shifted(recording, round(1e6 * late_s))
-    if not (coarse_us := frames_offset(recording)):
-        return recording
-    left_s = _timing(adjust.shifted(recording, coarse_us)).delay_s
-    return adjust.shifted(recording, coarse_us + round(1e6 * left_s))
+    return adjust.shifted(recording, _late_us(thinned(without_repeats(recording))))
+
+
+def _late_us(recording: Recording) -> int:
+    """By how much the events are behind the frames that an estimate uses."""
+    here = _timing(recording)
+    if here.late.seconds:
+        return round(1e6 * here.late.seconds)
+    if coarse_us := frames_offset(recording):
+        return coarse_us + round(1e6 * _timing(adjust.shifted(recording, coarse_us)).left_s)
+    if here != UNTIMED or len(recording.frame_times) < 2:
+        return 0
+    half_us = 0.5 * float(np.median(np.diff(recording.frame_times)))
+    for trial_us in FARTHER_US:
+        if abs(trial_us) < half_us + abs(FARTHER_US[0]) / 2 and (
+                left_s := _timing(adjust.shifted(recording, trial_us)).left_s):
+            return trial_us + round(1e6 * left_s)
+    return 0
 
 
 def _timing(recording: Recording) -> Timing:

@@ -195,8 +195,10 @@ class CameraEstimator:
         busiest = {_place(s) for s in self._busiest}
         front_end = self._front_end([s for s in stretches if _place(s) in busiest], timing)
         if agree(state.front_end, front_end):
+            settled = with_dead_time(state.front_end, front_end)
+            timing = timing._replace(exposure=before)
             return dataclasses.replace(
-                state, front_end=with_dead_time(state.front_end, front_end))
+                state, front_end=dataclasses.replace(settled, timing=timing))
         self._left = self._stretches - len(stretches)
         self._left_s = self._seconds - covered_s(s.span_us for s in stretches)
         return self._read(stretches, front_end)

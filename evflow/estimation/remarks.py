@@ -7,6 +7,7 @@ import numpy as np
 from evflow.camera import Summary
 from evflow.camera.optics import Optics
 from evflow.estimation.refine import Found, Lost
+from evflow.estimation.refine.frame_exposure import Late
 from evflow.estimation.refine.frame_timing import Timing
 from evflow.estimation.refine.receptor_result import OtherMap
 from evflow.estimation.shot import Shot
@@ -19,6 +20,7 @@ OPEN = 0.5  # of the stated error of theta: a log map that is told to be open is
 UNDETERMINED = 2.0  # times the stated error of theta: what the light alone may change is told
 FEW_EVENTS = 200  # of a polarity: with fewer its threshold is called uncertain
 
+BOUND_S = 3.8e-3  # delays beyond which a search is at its bound
 LATE_S = 2.5e-3  # three standard deviations of frame times, a priori; up to 4 ms are looked for
 
 UNMEASURED = Note(
@@ -132,20 +134,14 @@ def map_note(other: OtherMap, logarithmic: bool) -> Note:
 
 
 def timing_notes(timing: Timing, optics: Optics | None) -> list[Note]:
-    exposure, late = timing.exposure, timing.late
-    by, much = (late.seconds, f"{1e3 * abs(late.seconds):.1f} ± {1e3 * late.std_s:.1f} ms")
-    advice = f"Pass --frames-offset-ms {1e3 * by:.1f}, or auto."
-    if late.exposed_s:
-        advice += (f" (Frames exposed for {1e3 * late.exposed_s:.0f} ms before slow pixels look "
-                   "alike: --exposure-ms, if that is so.)")
-    if not by and optics is not None and abs(optics.delay_s) > LATE_S:
-        by, much = optics.delay_s, f"{1e3 * abs(optics.delay_s):.1f} ms"
-        advice = "Pass --frames-offset-ms."
-    found = [Note(
-        "frames.delay", f"events come {much} {'after' if by > 0 else 'before'} frames that show "
-        "the same: frame times are probably wrong, as those of the exposure's begin or end, or of "
-        "another clock. If so the cutoff is wrong too, and maps, noise rates and even thresholds "
-        f"may be. {advice}")] if by else []
+    exposure = timing.exposure
+    found = _late_notes(timing.late, optics)
+    if rolling_s := timing.rolling_s:
+        found.append(Note(
+            "frames.rolling", f"the bottom of the frames is {1e3 * abs(rolling_s):.0f} ms "
+            f"{'later' if rolling_s > 0 else 'earlier'} than their top, as of a rolling shutter: "
+            "thresholds come out too high where things move. Record slower motion, or with frames "
+            "of one time (global shutter)."))
     if not exposure.seconds:
         return found
     return [*found, Note(
@@ -153,6 +149,25 @@ def timing_notes(timing: Timing, optics: Optics | None) -> list[Note]:
         f"exposure of {1e3 * exposure.seconds:.0f} ± {1e3 * exposure.std_s:.0f} ms (frames out of "
         "focus look alike): the blur was taken out (--exposure-ms: the right one, or 0 to leave "
         "the blur).")]
+
+
+def _late_notes(late: Late, optics: Optics | None) -> list[Note]:
+    """On frame times that are probably wrong."""
+    by, much = late.seconds, f"{1e3 * abs(late.seconds):.1f} ± {1e3 * late.std_s:.1f} ms"
+    advice = f"Pass --frames-offset-ms {1e3 * by:.1f}, or auto."
+    if late.exposed_s:
+        advice = (f"Frames exposed for {1e3 * late.exposed_s:.0f} ms before slow pixels look "
+                  "alike: pass --exposure-ms if that is so, else "
+                  f"--frames-offset-ms {1e3 * by:.1f}, or auto.")
+    if not by and optics is not None and abs(optics.delay_s) > LATE_S:
+        by, much = optics.delay_s, f"{1e3 * abs(optics.delay_s):.1f} ms"
+        much += " or more" * (abs(by) > BOUND_S)
+        advice = "Pass --frames-offset-ms: auto, or a value that is known."
+    return [Note(
+        "frames.delay", f"events come {much} {'after' if by > 0 else 'before'} frames that show "
+        "the same: frame times are probably wrong, as those of the exposure's begin or end, or of "
+        "another clock. If so the cutoff is wrong too, and maps, noise rates and even thresholds "
+        f"may be. {advice}")] if by else []
 
 
 def lost_notes(lost: Lost | None, as_sent: Summary, summary: Summary) -> list[Note]:

@@ -9,9 +9,7 @@ rounding: so the residuals are compared with what the *neighbours'* events show,
 their own (instrumental variables, by two-stage least squares). And a signal that is drawn straight
 from event to event is cut where it turns: there it is an arc.
 
-Slow pixels delay events too, but they also blur them: to second order, a low-pass of time constant
-tau has a delay of tau and takes 12 tau^2 off the square of the length. And most are slower in the
-dark. So wrong frame times show, where neither is so.
+What the frames' times are wrong by follows from the delay (frame_clock.py).
 """
 
 from __future__ import annotations
@@ -23,13 +21,8 @@ import numpy as np
 
 from evflow.estimation.refine.between_events import changes
 from evflow.estimation.refine.busy import Busy, busy
-from evflow.estimation.refine.frame_exposure import (
-    ON_TIME,
-    UNSEEN,
-    Exposure,
-    Late,
-    is_untold,
-)
+from evflow.estimation.refine.frame_clock import BIAS, CLEARLY, Measured, Seen, late, rolling
+from evflow.estimation.refine.frame_exposure import ON_TIME, UNSEEN, Exposure, Late, is_untold
 from evflow.estimation.refine.path import Place
 from evflow.estimation.refine.receptor_data import TILES
 from evflow.light.log_maps import log64
@@ -46,28 +39,27 @@ REACH_US = 0.5 * LENGTHS_US[-1] - DELAYS_US[0], 0.5 * LENGTHS_US[-1] + DELAYS_US
 OFFSETS = (-16.0, -8.0, 0.0, 8.0, 16.0, 26.0, 40.0)  # DN
 BEYOND = 1.3  # times the interval between frames, so that an exposure as long as that is inside
 ENOUGH = 150  # changes
-CLEARLY, BIAS = 3.0, 70e6  # std of the square of the length that are none; its error in a scene
 EXPLAINS = 4.0  # times the least misfit, which that of no exposure exceeds if one is seen
+KNEE = 20.0  # DN, of a photoreceptor whose rate is proportional to light and this
 LEAST = np.log(0.7)  # log of the unexplained share, at most: else it is another scene or clock
 UNEQUAL = 0.05  # of a threshold, below which the other polarity foretells nothing
 NOTHING = 1e-9  # of the sums, so that one polarity alone, or no change, can be solved
 FEWEST, FEWEST_LENGTHS = 4, 3  # tiles, over which a length's scatter says something; lengths
 FLOOR_S = 2.5e-3  # std beside the scatter, of simulated cameras exposed for 10 and 20 ms
-LATE_STD_US = 700.0  # std beside the scatter, of a delay
-SLOWEST_US = 4000.0  # delay up to which slow pixels before frames of untold exposure are likelier
-DARK_STD_US = 300.0  # std beside the scatter, of how much longer the delay is in the dark
-KNEE = 20.0  # DN, of a photoreceptor whose rate is proportional to light and this
-PARTLY = 0.2  # of what pixels as slow take off, from which a part of the delay is theirs
-SLOW = 12.0  # square of the length over that of the delay, of a low-pass of first order
+# Columns of products: changes that neighbours show; ON and minus OFF of the pixels; their frames.
+AROUND, OWN, FRAMES = slice(0, 4), slice(4, 6), slice(6, 7)
+SOLVED = slice(4, 7)  # by least squares
 
 
 class Timing(NamedTuple):
-    """exposure: of the frames, where it is untold; late: of the events behind the frames, beyond
-    what slow pixels explain; delay_s: the same, whatever explains it; 0 if it is unknown."""
+    """exposure: of the frames, where it is untold; late: of the events behind the frames, where
+    slow pixels do not explain it; left_s: what they leave of it, however little; rolling_s: by
+    which the frames' bottom is later than their top; 0 if it is unknown."""
 
     exposure: Exposure = UNSEEN
     late: Late = ON_TIME
-    delay_s: float = 0.0
+    left_s: float = 0.0
+    rolling_s: float = 0.0
 
 
 UNTIMED = Timing()
@@ -89,35 +81,77 @@ def frame_timing(places: Sequence[Place]) -> Timing:
     lengths = LENGTHS_US[BEYOND * interval >= LENGTHS_US]
     if len(lengths) < FEWEST_LENGTHS:
         return UNTIMED
-    middle = min(MIDDLE_US, lengths[-1])
+    about = _about(runs, min(MIDDLE_US, lengths[-1]))
+    fits = _fits(runs, lengths, *about) if about else None
+    if fits is None:
+        return UNTIMED
+    if rolling(*fits.sloping_us):
+        return UNTIMED._replace(rolling_s=1e-6 * fits.rolling_us)
+    misfits = fits.misfits
+    explains = misfits[len(SHARPER)] > EXPLAINS * misfits.min() and (
+        int(np.argmin(misfits)) < len(misfits) - 1)  # longer ones may do so better
+    exposure = _exposure(*fits.square, interval) if untold and explains else UNSEEN
+    square = fits.square[0] - told_us**2, fits.square[1]
+    left_us, wrong = late(Seen(fits.delay_us, fits.darker_us, square, _longer(runs)),
+                          interval if untold else 0.0)
+    return Timing(exposure, wrong, 1e-6 * left_us)
+
+
+def _about(runs: Sequence[Busy], middle_us: float) -> tuple[int, float] | None:
+    """Where least squares explain most: index of the delay, and the offset in DN; None if that is
+    at a bound, or does not explain enough."""
     of_frames = np.stack([np.concatenate([_of_frames(run, o) for run in runs]) for o in OFFSETS])
-    logs = np.stack([_unexplained(runs, of_frames, middle, delay) for delay in DELAYS_US])
+    logs = np.stack([_unexplained(runs, of_frames, middle_us, delay) for delay in DELAYS_US])
     delay, offset = (int(k) for k in np.unravel_index(np.argmin(logs), logs.shape))
     if delay in (0, 1, len(DELAYS_US) - 2, len(DELAYS_US) - 1) or logs.min() > LEAST:
-        return UNTIMED
-    at = DELAYS_US[delay - 2:delay + 3]
+        return None
+    return delay, OFFSETS[offset]
+
+
+class Fits(NamedTuple):
+    """Values and their errors: delay_us, of the events; darker_us, how much longer it is in the
+    darker half; square, of the exposure's length; sloping_us, how much longer the delay is at the
+    bottom. rolling_us: the last, where it is more than the delays that were tried first. misfits:
+    of SHARPER and the lengths."""
+
+    delay_us: Measured
+    darker_us: Measured
+    square: Measured
+    sloping_us: Measured
+    rolling_us: float
+    misfits: Array
+
+
+def _fits(runs: Sequence[Busy], lengths: Array, delay: int, offset: float) -> Fits | None:
+    """About this delay, by its index, and offset; None if too little was seen, or of one polarity
+    alone. The errors are a jackknife's over tiles of the image."""
+    middle, at = min(MIDDLE_US, lengths[-1]), DELAYS_US[delay - 2:delay + 3]
     means = [*((middle, delay_us) for delay_us in at), *((length, at[2]) for length in lengths)]
-    table = _products(runs, means, at[2], OFFSETS[offset])
+    table = _products(runs, means, at[2], offset)
     used = np.flatnonzero(np.trace(table[0].sum(1), axis1=1, axis2=2))
-    if len(used) < FEWEST or not _of_both(table[2].sum((0, 1))[4:, 4:]):
-        return UNTIMED
+    if len(used) < FEWEST or not _of_both(table[2].sum((0, 1))[SOLVED, SOLVED]):
+        return None
+    row = np.tile(np.repeat(np.arange(TILES[0]), TILES[1]), len(runs))
+    slow = _slow_times(runs)
 
-    def measured(products: Array) -> Array:
-        of_delays = products[:len(at), ..., 4:, 4:].sum(1)
-        dark, bright = (_delay(at, of_delays[:, k]) for k in (0, 1))
-        return np.array([_delay(at, of_delays.sum(1)), dark - bright,
-                         _lowest(*_misfits(lengths, products[len(at):].sum((1, 2))))])
+    def measured(products: Array, row: Array) -> Array:
+        of_delays = products[:len(at), ..., SOLVED, SOLVED]
+        by_light = of_delays.sum(1)
+        dark, bright = (_delay(at, by_light[:, k]) for k in (0, 1))
+        return np.array([_delay(at, by_light.sum(1)), dark - bright,
+                         _lowest(*_misfits(lengths, products[len(at):].sum((1, 2)))),
+                         _sloping(at, of_delays.sum(2), row, slow)])
 
-    best = measured(table)
-    without = [measured(np.delete(table, b, 1)) for b in used]
+    best = measured(table, row)
+    without = [measured(np.delete(table, b, 1), np.delete(row, b)) for b in used]
     error = np.sqrt((len(used) - 1) * np.var(without, 0))
-    late_us, by_light, square = zip(best.tolist(), error.tolist(), strict=True)
-    misfits = _misfits(lengths, table[len(at):].sum((1, 2)))[1]
-    explained = misfits[len(SHARPER)] > EXPLAINS * misfits.min()
-    seen = square[0] < lengths[-1]**2 and untold and explained
-    longer = (_longer_in_the_dark(runs) * late_us[0] - by_light[0], by_light[1])
-    late = _late(late_us, longer, (square[0] - told_us**2, square[1]), untold=untold)
-    return Timing(_exposure(*square, interval) if seen else UNSEEN, late, 1e-6 * late_us[0])
+    delay_us, darker_us, square, sloping_us = zip(best.tolist(), error.tolist(), strict=True)
+    rolling_us = sloping_us[0]
+    if rolling(*sloping_us):
+        wide = _products(runs, [(middle, delay_us) for delay_us in DELAYS_US], at[2], offset)
+        rolling_us = _sloping(DELAYS_US, wide[..., SOLVED, SOLVED].sum(2), row, slow)
+    return Fits(delay_us, darker_us, square, sloping_us, rolling_us,
+                _misfits(lengths, table[len(at):].sum((1, 2)))[1])
 
 
 def _exposure(square: float, error: float, interval_us: float) -> Exposure:
@@ -129,7 +163,7 @@ def _exposure(square: float, error: float, interval_us: float) -> Exposure:
                     float(np.hypot(5e-7 * error / length, FLOOR_S)))
 
 
-def _longer_in_the_dark(runs: Sequence[Busy]) -> float:
+def _longer(runs: Sequence[Busy]) -> float:
     """By which share of their delay slow pixels are later in the darker half than in the other."""
     dn = np.concatenate([0.5 * (run.before + run.after) for run in runs])
     bright = np.concatenate([run.block % 2 == 1 for run in runs])
@@ -139,27 +173,33 @@ def _longer_in_the_dark(runs: Sequence[Busy]) -> float:
     return 2.0 * (times[0] - times[1]) / (times[0] + times[1])
 
 
-def _late(
-    delay_us: tuple[float, float], missing_us: tuple[float, float], square: tuple[float, float], *,
-    untold: bool,
-) -> Late:
-    """Events that are late by this, of values and their errors; not if they are blurred, or later
-    in the dark, as those of slow pixels. missing_us: how much later these would be in the dark."""
-    late_us, std_us = delay_us[0], float(np.hypot(delay_us[1], LATE_STD_US))
-    error = float(np.hypot(square[1], BIAS))
-    taken = SLOW * late_us**2  # off the square, by pixels that are as slow
-    more = square[0] + taken
-    if abs(late_us) <= CLEARLY * std_us:
-        return ON_TIME
-    if late_us < 0.0:
-        return Late(1e-6 * late_us, 1e-6 * std_us)
-    if untold and late_us < SLOWEST_US:
-        return ON_TIME
-    if more <= CLEARLY * error or square[0] <= -PARTLY * taken:
-        return ON_TIME
-    if missing_us[0] <= CLEARLY * float(np.hypot(missing_us[1], DARK_STD_US)):
-        return ON_TIME
-    return Late(1e-6 * late_us, 1e-6 * std_us, 1e-6 * more**0.5 * untold)
+def _slow_times(runs: Sequence[Busy]) -> Array:
+    """(TILES[0],) in which slow pixels would be late, relative to each other, row by row."""
+    rows = np.concatenate([run.block // 2 // TILES[1] for run in runs])
+    dn = np.concatenate([0.5 * (run.before + run.after) for run in runs])
+    number = np.bincount(rows, minlength=TILES[0])
+    mean = np.bincount(rows, dn, TILES[0]) / np.maximum(number, 1)
+    times = 1.0 / (mean + KNEE)
+    return times / times[number > 0].mean()
+
+
+def _sloping(at: Array, of_delays: Array, row: Array, slow: Array) -> float:
+    """How much longer the delay is at the bottom of the frames than at their top, beside what slow
+    pixels can explain: products (delays, blocks, 3, 3), and rows of the blocks."""
+    sums = [of_delays[:, row == k].sum(1) for k in range(TILES[0])]
+    weight = np.array([np.trace(total[0]) for total in sums])
+    delays = np.array([_delay(at, total) if w else 0.0
+                       for w, total in zip(weight, sums, strict=True)])
+    down = np.arange(TILES[0]) / TILES[0]
+
+    def fitted(values: Array, *columns: Array) -> Array:
+        scale = np.sqrt(weight)
+        both = np.stack([np.ones(TILES[0]), *columns], 1) * scale[:, None]
+        return np.linalg.lstsq(both, scale * values, rcond=None)[0]
+
+    most = max(float(weight @ delays) / weight.sum(), 0.0)  # slow pixels explain no more than all
+    share = np.clip(fitted(delays, down, slow)[2], 0.0, most)
+    return float(fitted(delays - share * slow, down)[1])
 
 
 def _of_frames(run: Busy, offset: float) -> Array:
@@ -224,8 +264,8 @@ def _misfits(lengths: Array, total: Array) -> tuple[Array, Array]:
     bend = (total[k] - total[0]) / (lengths[k]**2 - lengths[0]**2)
     total = np.concatenate([total[0] + SHARPER[:, None, None] * bend, total])
     size = NOTHING * (1.0 + np.trace(total[-1]))
-    weight = np.linalg.inv(total[..., :4, :4] + size * np.eye(4))
-    counts, frames = total[..., :4, 4:6], total[..., :4, 6:]
+    weight = np.linalg.inv(total[..., AROUND, AROUND] + size * np.eye(4))
+    counts, frames = total[..., AROUND, OWN], total[..., AROUND, FRAMES]
     weighted = np.swapaxes(counts, -1, -2) @ weight
     theta = np.linalg.solve(weighted @ counts + NOTHING * np.eye(2), weighted @ frames)
     left = frames - counts @ theta
