@@ -60,6 +60,7 @@ NOTES: dict[str, str] = {
     "frames.repeated": "frames repeat the one before",
     "frames.replaced": "the frames come from another file",
     "frames.response": "the usual response curve of the frames was assumed",
+    "frames.rolling": "the rows of the frames are not of one time",
     "frames.still": "all frames are the same",
     "frames.stream": "which of several image streams was read",
     "frames.slowed": "frame times were divided by the slow-motion factor",

@@ -135,13 +135,13 @@ def map_note(other: OtherMap, logarithmic: bool) -> Note:
 
 def timing_notes(timing: Timing, optics: Optics | None) -> list[Note]:
     exposure = timing.exposure
-    found = _late_notes(timing.late, optics)
     if rolling_s := timing.rolling_s:
-        found.append(Note(
+        return [Note(
             "frames.rolling", f"the bottom of the frames is {1e3 * abs(rolling_s):.0f} ms "
             f"{'later' if rolling_s > 0 else 'earlier'} than their top, as of a rolling shutter: "
             "thresholds come out too high where things move. Record slower motion, or with frames "
-            "of one time (global shutter)."))
+            "of one time (global shutter).")]
+    found = _late_notes(timing.late, optics)
     if not exposure.seconds:
         return found
     return [*found, Note(

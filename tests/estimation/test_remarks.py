@@ -83,6 +83,13 @@ def test_what_frame_times_are_wrong_by_is_told_and_stands_first(exposed_s: float
     assert timing_notes(Timing(UNSEEN), None) == []
 
 
+@pytest.mark.parametrize(("rolling_s", "way"), [(0.012, "later"), (-0.012, "earlier")])
+def test_a_rolling_shutter_is_told(rolling_s: float, way: str) -> None:
+    note, = timing_notes(UNTIMED._replace(rolling_s=rolling_s), Optics(0.0, -4e-3, 1.0, 1e-4))
+    assert note.code == "frames.rolling"
+    assert f"the bottom of the frames is 12 ms {way} than their top" in note.text
+
+
 @pytest.mark.parametrize("sought", [True, False])
 def test_a_photoreceptor_that_was_looked_for_in_vain_is_told(sought: bool) -> None:
     notes = receptor_notes(None, None, SUMMARY, STD, sought=sought)
