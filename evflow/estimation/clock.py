@@ -40,15 +40,20 @@ def _late_us(recording: Recording) -> int:
     if here.late.seconds:
         return round(1e6 * here.late.seconds)
     if coarse_us := frames_offset(recording):
-        return coarse_us + round(1e6 * _timing(adjust.shifted(recording, coarse_us)).left_s)
+        return _nearer(recording, coarse_us)
     if here != UNTIMED or len(recording.frame_times) < 2:
         return 0
     half_us = 0.5 * float(np.median(np.diff(recording.frame_times)))
     for trial_us in FARTHER_US:
         if abs(trial_us) < half_us + abs(FARTHER_US[0]) / 2 and (
-                left_s := _timing(adjust.shifted(recording, trial_us)).left_s):
-            return trial_us + round(1e6 * left_s)
+                found_us := _nearer(recording, trial_us)) != trial_us:
+            return found_us
     return 0
+
+
+def _nearer(recording: Recording, about_us: int) -> int:
+    """The offset near this one at which frames and events agree; the same if that is unknown."""
+    return about_us + round(1e6 * _timing(adjust.shifted(recording, about_us)).left_s)
 
 
 def _timing(recording: Recording) -> Timing:
