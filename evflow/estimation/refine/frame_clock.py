@@ -18,6 +18,7 @@ CLEARLY, BIAS = 3.0, 70e6  # std of a square of lengths (us^2) that are none; it
 LATE_STD_US = 700.0  # std beside the scatter, of a delay
 DARK_STD_US = 300.0  # std beside the scatter, of how much longer the delay is in the dark
 LEAST_LATE_US = 4000.0  # beyond slow pixels, as far as their blur and the dark tell them
+OPEN = 0.5  # share of it that a time constant may be longer than its blur tells: long ones are
 SLOW = 12.0  # square of the length over that of the delay, of a low-pass of first order
 TOLERANCE = 1.1  # of the interval between frames, which no exposure exceeds
 LEAST_ROLLING_US, CLEARLY_ROLLING = 5000.0, 5.0  # from top to bottom; in std
@@ -55,7 +56,7 @@ def late(seen: Seen, interval_us: float) -> tuple[float, Late]:
         return left_us, Late(1e-6 * left_us, 1e-6 * stated_us)
     more = seen.square[0] + SLOW * delay_us**2  # than the square less what pixels as slow take
     missing_us = seen.longer * delay_us - seen.darker_us[0]
-    if (left_us < LEAST_LATE_US or more <= CLEARLY * error
+    if (left_us < LEAST_LATE_US + OPEN * tau_us or more <= CLEARLY * error
             or missing_us <= CLEARLY * float(np.hypot(seen.darker_us[1], DARK_STD_US))):
         return left_us, ON_TIME
     alike_us = float(np.sqrt(more))
