@@ -96,6 +96,11 @@ def refine(state: State) -> Known:
     return dataclasses.replace(start, summary=summary, std=std, optics=optics)
 
 
+def _mismatch(summary: Summary) -> np.ndarray:
+    """(2,) ON and OFF, relative to the thresholds."""
+    return np.array([summary.sigma_on / summary.theta_on, summary.sigma_off / summary.theta_off])
+
+
 def estimate(
     state: State, *, extent: Extent | None = None, before: Sequence[Note] = (),
     after: Sequence[Note] = (), advance: Advance = lambda: None, stage: Stage = lambda _: None,
@@ -137,7 +142,7 @@ def estimate(
     if hot.any():
         camera, error = maps.with_hot_rates(
             camera, error, hot, *hot_rates(
-                sent, state.sent, state.seconds, hot, alone=shot.falls))
+                sent, state.sent, state.seconds, hot, _mismatch(summary), alone=shot.falls))
     as_sent = summary
     if lost := front_end.lost:
         camera, error, summary, std = maps.with_contrast_lost(

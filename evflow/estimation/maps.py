@@ -104,11 +104,13 @@ def with_rates(
 def with_hot_rates(
     camera: Camera, std: Camera, hot: np.ndarray, rates: np.ndarray, errors: np.ndarray
 ) -> tuple[Camera, Camera]:
-    """The maps with these noise rates (2, N) of the hot (H, W) pixels, and their std."""
+    """The maps with these noise rates (2, N) of the hot (H, W) pixels, and their std; where they
+    are NaN the maps stay."""
     def put(of: Camera, values: np.ndarray) -> Camera:
+        maps = {name: getattr(of, name) for name in ("eta_on", "eta_off")}
         return dataclasses.replace(of, **{
-            name: getattr(of, name).at[hot].set(v.astype(np.float32))
-            for name, v in zip(("eta_on", "eta_off"), values, strict=True)})
+            name: rate.at[hot].set(np.where(np.isnan(v), rate[hot], v).astype(np.float32))
+            for (name, rate), v in zip(maps.items(), values, strict=True)})
 
     return put(camera, rates), put(std, errors)
 

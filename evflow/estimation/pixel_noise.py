@@ -35,6 +35,7 @@ SHARES = np.linspace(SIGNAL, 1.0, 6)  # of the noise, that follows the threshold
 UNEVEN_ERROR, COUNTS_ERROR = 0.3, 0.15
 PLAIN_THETA, PLAIN_ODDS = 0.1, 1.0  # log units: twice STILL; log odds among pixels above it only
 
+HOT_SHARE, CLEARLY = 1e-3, 2.0  # of pixels, that are hot a priori; std that more events are
 BESIDE = 5  # pixels: side of the neighbourhood that sees what a hot pixel does
 AROUND = 9  # pixels: side of the neighbourhood in which other events are counted
 CHANCE = 4.0  # standard deviations of noise allowed around a pixel
@@ -136,17 +137,20 @@ def pixel_rates(
 
 
 def hot_rates(
-    quiet: Array, sent: Array, seconds: float, hot: Array, *, alone: bool = False
+    quiet: Array, sent: Array, seconds: float, hot: Array, mismatch: Array, *, alone: bool = False
 ) -> tuple[Array, Array]:
-    """Noise rates (2, N) in Hz of the hot (H, W) pixels, and their std.
+    """Noise rates (2, N) in Hz of the hot (H, W) pixels, and their std; NaN where they are unknown.
 
     What they send while nothing happens near them, quiet (2, 2, H, W) of `quiet_time`, and, as
     where the whole scene moves nothing ever rests, what they send in the rest of the `seconds`
     beyond the median of their neighbours, whose spread is in its error; both weighted by their
-    precision. sent (2, H, W): ON and OFF events. alone: the former alone where there is any, as its
-    rates are at another light than the latter."""
+    precision. The former alone where a low threshold explains the latter, which it does if hot ones
+    are rarer than pixels whose threshold is as much lower, of this relative mismatch (2,). sent
+    (2, H, W): ON and OFF events. alone: the former alone where there is any, as its rates are at
+    another light than the latter."""
     rates, stds = [], []
-    for (events, watched), own in zip(quiet, sent.astype(np.float32), strict=True):
+    for (events, watched), own, uneven in zip(
+            quiet, sent.astype(np.float32), mismatch, strict=True):
         usual = cv2.medianBlur(np.where(hot, 0.0, own).astype(np.float32), BESIDE)
         spread = cv2.medianBlur(np.abs(own - usual), BESIDE)[hot]
         n, rested = events[hot].astype(np.float64), watched[hot].astype(np.float64)
@@ -155,9 +159,12 @@ def hot_rates(
         beyond = np.maximum(left - usual[hot], 0.0) / busy
         error = np.sqrt(left + 1.0 + (1.5 * spread) ** 2) / busy
         weight = np.stack([rested**2 / (n + 1.0), error**-2.0])
+        lower = usual[hot] / np.maximum(own[hot], 1.0) - 1.0  # threshold that sends as much
+        as_likely = special.ndtr(np.minimum(lower, 0.0) / uneven) > HOT_SHARE
+        weight[1, as_likely & (beyond > CLEARLY * error)] = 0.0
         if alone:
             weight[1, rested > 0] = 0.0
-        total = weight.sum(0)
+        total = np.where(weight.any(0), weight.sum(0), np.nan)
         rates.append((weight * [n / np.maximum(rested, 1e-9), beyond]).sum(0) / total)
         stds.append(total**-0.5)
     return np.stack(rates), np.stack(stds)

@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 from evflow.camera import Camera, Summary
-from evflow.estimation.maps import with_rates, with_unquiet_error
+from evflow.estimation.maps import with_hot_rates, with_rates, with_unquiet_error
 from evflow.estimation.pixel_noise import (
     ODD,
     SPREAD,
@@ -23,6 +23,7 @@ from evflow.estimation.pixel_noise import (
 
 SHAPE = (96, 128)
 NONE_HOT = np.zeros(SHAPE, bool)
+ALIKE = np.full(2, 0.1)  # mismatch of thresholds, relative
 
 
 def drawn(spread: float, seconds: np.ndarray, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -258,7 +259,7 @@ def test_hot_pixels_before_moving_scenes_have_what_they_send_beyond_their_neighb
     hot = np.zeros(shape, bool)
     hot[4::8, 4::8] = True
     sent[0, hot] += rng.poisson(24.0 * seconds, hot.sum())
-    rate, std = hot_rates(np.zeros((2, 2, *shape), np.float32), sent, seconds, hot)
+    rate, std = hot_rates(np.zeros((2, 2, *shape), np.float32), sent, seconds, hot, ALIKE)
     away = (rate - [[24.0], [0.0]]) / std
     assert abs(away[0].mean()) < 0.3
     assert 0.8 < away[0].std() < 1.2
@@ -274,7 +275,7 @@ def test_what_hot_pixels_send_at_rest_counts_by_its_precision() -> None:
     sent[:, 10, 10] = 600 + 60 * 24, 601
     quiet = np.zeros((2, 2, *shape), np.float32)
     quiet[:, :, 10, 10] = [[480.0, 20.0], [0.0, 20.0]]
-    (on, off), (on_std, off_std) = (v[:, 0] for v in hot_rates(quiet, sent, 60.0, hot))
+    (on, off), (on_std, off_std) = (v[:, 0] for v in hot_rates(quiet, sent, 60.0, hot, ALIKE))
     assert on == pytest.approx(24.0, abs=2 * on_std)
     assert on_std < 1.0
     assert off < 0.1
@@ -289,8 +290,26 @@ def test_quiet_time_is_counted_once() -> None:
     sent = np.where(hot, rng.poisson(600.0, (2, *shape)), rng.poisson(3.0, (2, *shape)))
     quiet = np.stack([sent, np.full(sent.shape, 30.0)], 1)
     for alone in (False, True):
-        rate, std = hot_rates(quiet, sent, 30.0, hot, alone=alone)
+        rate, std = hot_rates(quiet, sent, 30.0, hot, ALIKE, alone=alone)
         assert 0.85 < ((rate - 20.0) / std).std() < 1.15
     quiet[:, 0] *= 2.0  # at another light
-    np.testing.assert_allclose(hot_rates(quiet, sent, 30.0, hot, alone=True)[0],
+    np.testing.assert_allclose(hot_rates(quiet, sent, 30.0, hot, ALIKE, alone=True)[0],
                                sent[:, hot] / 15.0)
+
+
+def test_signal_of_low_thresholds_is_no_noise_of_hot_pixels() -> None:
+    """Of pixels of which one in six has half the threshold, one that sends five times as much and
+    was quiet for a while, and one that never was; with even thresholds both are hot."""
+    shape, hot = (20, 20), np.zeros((20, 20), bool)
+    hot[5, 10] = hot[15, 10] = True
+    sent = np.random.default_rng(1).poisson(100.0, (2, *shape)).astype(np.float64)
+    sent[:, hot] = 500.0
+    quiet = np.zeros((2, 2, *shape), np.float32)
+    quiet[:, :, 5, 10] = 4.0, 0.4
+    rates, _ = hot_rates(quiet, sent, 1.0, hot, np.full(2, 0.5))
+    np.testing.assert_allclose(rates[:, 0], 10.0, rtol=1e-5)
+    assert np.isnan(rates[:, 1]).all()
+    np.testing.assert_allclose(hot_rates(quiet, sent, 1.0, hot, ALIKE)[0][:, 1], 400.0, rtol=0.1)
+    camera = Camera.constant(shape, theta_on=0.2, theta_off=0.2, eta_on=0.3, eta_off=0.3)
+    kept, _ = with_hot_rates(camera, camera, hot, rates, rates)
+    np.testing.assert_allclose(np.asarray(kept.eta_on)[hot], [10.0, 0.3], rtol=1e-5)
