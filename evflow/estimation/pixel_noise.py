@@ -18,7 +18,7 @@ Array = np.ndarray
 
 SPREADS = np.geomspace(0.02, 2.0, 41)  # standard deviations of the rate, relative to its mean
 SPREAD, SPREAD_ERROR = 0.1, 0.8  # prior median of the spread, and std of its log
-NEGLIGIBLE = 1e-4  # probability below which a spread is left out
+NEGLIGIBLE = 1e-4  # probability below which a spread is left out, and spread that is none
 # Pixels that are noisier than the others without being hot: their share, and the shape and mean of
 # their rates relative to the camera's.
 ODD, ODD_SHAPE, ODD_MEAN = 1e-3, 0.5, 5.0
@@ -160,7 +160,7 @@ def hot_rates(
         error = np.sqrt(left + 1.0 + (1.5 * spread) ** 2) / busy
         weight = np.stack([rested**2 / (n + 1.0), error**-2.0])
         lower = usual[hot] / np.maximum(own[hot], 1.0) - 1.0  # threshold that sends as much
-        as_likely = special.ndtr(np.minimum(lower, 0.0) / uneven) > HOT_SHARE
+        as_likely = special.ndtr(np.minimum(lower, 0.0) / max(uneven, NEGLIGIBLE)) > HOT_SHARE
         weight[1, as_likely & (beyond > CLEARLY * error)] = 0.0
         if alone:
             weight[1, rested > 0] = 0.0
