@@ -23,7 +23,7 @@ SLOW = 12.0  # square of the length over that of the delay, of a low-pass of fir
 TOLERANCE = 1.1  # of the interval between frames, which no exposure exceeds
 LEAST_ROLLING_US, CLEARLY_ROLLING = 5000.0, 5.0  # from top to bottom; in std
 
-Measured = tuple[float, float]  # value and error
+WithError = tuple[float, float]  # value and error
 
 
 class Seen(NamedTuple):
@@ -31,9 +31,9 @@ class Seen(NamedTuple):
     half; square: of the exposure's length, less what is told of it, us^2; longer: share of the
     delay of slow pixels by which it would be longer in the darker half."""
 
-    delay_us: Measured
-    darker_us: Measured
-    square: Measured
+    delay_us: WithError
+    darker_us: WithError
+    square: WithError
     longer: float
 
 

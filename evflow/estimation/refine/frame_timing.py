@@ -21,7 +21,7 @@ import numpy as np
 
 from evflow.estimation.refine.between_events import changes
 from evflow.estimation.refine.busy import Busy, busy
-from evflow.estimation.refine.frame_clock import BIAS, CLEARLY, Measured, Seen, late, rolling
+from evflow.estimation.refine.frame_clock import BIAS, CLEARLY, Seen, WithError, late, rolling
 from evflow.estimation.refine.frame_exposure import ON_TIME, UNSEEN, Exposure, Late, is_untold
 from evflow.estimation.refine.path import Place
 from evflow.estimation.refine.receptor_data import TILES
@@ -114,10 +114,10 @@ class Fits(NamedTuple):
     bottom. rolling_us: the last, where it is more than the delays that were tried first. misfits:
     of SHARPER and the lengths."""
 
-    delay_us: Measured
-    darker_us: Measured
-    square: Measured
-    sloping_us: Measured
+    delay_us: WithError
+    darker_us: WithError
+    square: WithError
+    sloping_us: WithError
     rolling_us: float
     misfits: Array
 
