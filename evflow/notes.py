@@ -66,6 +66,7 @@ NOTES: dict[str, str] = {
     "frames.slowed": "frame times were divided by the slow-motion factor",
     "frames.swept": "the frames are views of a sensor moved over one picture",
     "frames.unit": "the unit of the frame times was inferred",
+    "frames.unrolled": "events were moved by the times at which rows of the frames were read",
     "frames.unused": "frames were left out",
     "frames.white": "the value that counts as white",
     "levels.added": "pixels see more or less light than the levels say",

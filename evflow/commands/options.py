@@ -18,6 +18,7 @@ import tyro
 
 from evflow.errors import EvflowDataError
 from evflow.light.colour import Colour
+from evflow.recordings.rolling import Side
 
 if TYPE_CHECKING:
     from evflow.types import Recording
@@ -28,7 +29,7 @@ LARGEST = 1e13  # limit of any number: as ms since 1970 it is in 2286, and fits 
 
 ELSEWHERE = ("timestamps", "timestamps_unit", "frames_fps", "full_scale")  # for --frames
 CHANGES = ("frames_offset_ms", "flip_frames", "response", "bayer", "colour",
-           "exposure_ms")  # for any frames
+           "exposure_ms", "rolling_ms", "rolling_from")  # for any frames
 OWN = ("frames_topic", "no_frames")  # for the recording's own
 
 
@@ -101,6 +102,11 @@ class Reading:
     """White of --frames; the default is 255, or 65535 for 16-bit images. 12-bit data: 4095."""
     frames_offset_ms: Literal["auto"] | float = 0.0
     """Added to the frame times; auto finds the offset at which events and frames agree."""
+    rolling_ms: Literal["auto"] | float = 0.0
+    """Time from the first row of a frame to the last, if they are read one after the other (a
+    rolling shutter): events are moved by that of their row; auto finds it, and where it begins."""
+    rolling_from: Side = "top"
+    """The side of the frames that is read first."""
     flip_frames: Literal["none", "horizontal", "vertical", "both"] = "none"
     """Mirror the frames."""
     exposure_ms: Annotated[float | None, value("MS")] = None
@@ -133,6 +139,8 @@ class Reading:
             raise EvflowDataError(
                 "EV020", f"--bayer {self.bayer} converts a mosaic to luma, --colour {self.colour} "
                 "keeps it.", "Give only one of them.")
+        if self.rolling_ms in (0.0, "auto"):
+            refuse(self, ("rolling_from",), "it belongs to a time, --rolling-ms")
         own = with_frames and self.frames is None
         recording = io.read_recording(
             path, start_s=self.start, stop_s=self.stop, time_unit=self.time_unit,
@@ -166,13 +174,20 @@ class Reading:
             recording = adjust.exposed(recording, self.exposure_ms)
         recording = adjust.linearised(recording, self.response)
         recording = recording if self.colour == "luma" else adjust.balanced(recording)
-        return _aligned(recording) if self.frames_offset_ms == "auto" else recording
+        return self._timed(recording)
 
+    def _timed(self, recording: Recording) -> Recording:
+        """The recording with frames of one time that agrees with the events'."""
+        from evflow.estimation.clock import aligned, rolling
+        from evflow.recordings.rolling import Rolling, unrolled
 
-def _aligned(recording: Recording) -> Recording:
-    from evflow.estimation.clock import aligned
-
-    return aligned(recording)
+        is_off = self.frames_offset_ms == "auto"
+        if self.rolling_ms == "auto":
+            recording = aligned(recording) if is_off else recording
+            recording = unrolled(recording, rolling(recording))
+        elif self.rolling_ms:
+            recording = unrolled(recording, Rolling(1e-3 * self.rolling_ms, self.rolling_from))
+        return aligned(recording) if is_off else recording
 
 
 def given(options: Any, names: Iterable[str]) -> str:

@@ -1,4 +1,4 @@
-"""Frame times that agree with the events."""
+"""Frame times that agree with the events; how long frames take to be read."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from evflow.recordings import adjust
 from evflow.recordings.check import frames_offset
 from evflow.recordings.dense import thinned
 from evflow.recordings.repeats import without_repeats
+from evflow.recordings.rolling import Rolling
 from evflow.recordings.windows import plan_windows
 from evflow.types import Recording
 
@@ -32,6 +33,19 @@ def aligned(recording: Recording) -> Recording:
         The recording, with a note if it is shifted.
     """
     return adjust.shifted(recording, _late_us(thinned(without_repeats(recording))))
+
+
+def rolling(recording: Recording) -> Rolling:
+    """How the frames are read, if the events show that their rows or columns are not of one time
+    (from 5 ms on); else `GLOBAL`.
+
+    Args:
+        recording: with frames whose times are right within some ms (`aligned`).
+
+    Returns:
+        The time from side to side, and the side that is read first.
+    """
+    return _timing(thinned(without_repeats(recording))).rolling
 
 
 def _late_us(recording: Recording) -> int:

@@ -119,6 +119,8 @@ def estimate(
     if lacking := undetermined(stats, summary):
         summary, std, alone = with_prior(lacking, list(refined.chunks), summary, std)
     summary, std = no_more_than_all(stats, summary, std)
+    if rolling_s := front_end.timing.rolling.seconds:
+        std = maps.with_rolling_error(summary, std, rolling_s)
     stage("noise rates and maps")
     quiet = quiet_times(
         _counted(windows_of(state.read), advance), summary, refined.faulty, front_end.seen_by)

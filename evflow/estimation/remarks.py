@@ -135,12 +135,12 @@ def map_note(other: OtherMap, logarithmic: bool) -> Note:
 
 def timing_notes(timing: Timing, optics: Optics | None) -> list[Note]:
     exposure = timing.exposure
-    if rolling_s := timing.rolling_s:
+    if (rolling := timing.rolling).seconds:
+        start = "" if rolling.first == "top" else f" --rolling-from {rolling.first}"
         return [Note(
-            "frames.rolling", f"the bottom of the frames is {1e3 * abs(rolling_s):.0f} ms "
-            f"{'later' if rolling_s > 0 else 'earlier'} than their top, as of a rolling shutter: "
-            "thresholds come out too high where things move. Record slower motion, or with frames "
-            "of one time (global shutter).")]
+            "frames.rolling", f"frames were read {rolling}, as by a rolling shutter: thresholds "
+            "come out too high where things move, by as much as their errors now allow. To take "
+            f"it out pass --rolling-ms {1e3 * rolling.seconds:.1f}{start}, or auto.")]
     found = _late_notes(timing.late, optics)
     if not exposure.seconds:
         return found

@@ -19,6 +19,7 @@ from evflow.commands.writing import named
 from evflow.errors import EvflowDataError
 from evflow.io import read_recording, write_recording
 from evflow.light.colour import PATTERNS
+from evflow.recordings.rolling import Rolling, unrolled
 from evflow.types import Recording
 
 
@@ -81,7 +82,9 @@ def test_options_without_effect_are_told(folder: Path, capsys: pytest.CaptureFix
     "convert flight.npz a.h5 --format npz", "simulate flight.npz -o a.aedat4 --format dsec",
     "simulate flight.npz -o a.mp4", "convert flight.npz -", "estimate flight.npz -o -",
     "voxel flight.npz -o a.npz --window-ms 1e16", "info flight.npz --frames-offset-ms 1e18",
-    "info flight.npz --frames flight.npz --frames-fps 1e-12"])
+    "info flight.npz --frames flight.npz --frames-fps 1e-12",
+    "info flight.npz --rolling-ms -5", "info flight.npz --rolling-ms 2e4",
+    "info flight.npz --rolling-from left", "info flight.npz --rolling-ms auto --rolling-from left"])
 def test_contradictions_and_wrong_names_are_refused(
     folder: Path, line: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -90,6 +93,19 @@ def test_contradictions_and_wrong_names_are_refused(
     assert (code, said[:5]) == (2, "EV020")
     assert "Traceback" not in said
     assert sorted(folder.iterdir()) == before
+
+
+def test_events_are_moved_as_their_line_of_the_frames_was_read(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, said = run("convert flight.npz a.npz --rolling-ms 12 --rolling-from left", capsys)
+    assert code == 0
+    assert "frames were read from the left to the right in 12 ms" in said
+    before, after = read_recording(folder / "flight.npz"), read_recording(folder / "a.npz")
+    expected = unrolled(before, Rolling(0.012, "left"))
+    np.testing.assert_array_equal(after.events.t, expected.events.t)
+    np.testing.assert_array_equal(after.frame_times, expected.frame_times)
+    assert run("info flight.npz --rolling-ms auto --frames-offset-ms auto", capsys) == (0, "")
 
 
 @pytest.mark.parametrize("line", [

@@ -10,7 +10,12 @@ import numpy as np
 import pytest
 
 from evflow.camera import Camera, Summary
-from evflow.estimation.maps import SLOW_BIAS, regressed, with_contrast_lost
+from evflow.estimation.maps import (
+    SLOW_BIAS,
+    regressed,
+    with_contrast_lost,
+    with_rolling_error,
+)
 from evflow.estimation.refine import Lost
 from evflow.estimation.refine.receptor_result import STEPPED_LOW, Found
 from evflow.simulator.photoreceptor import TYPICAL, Photoreceptor
@@ -28,6 +33,13 @@ def found(explained: float, **photoreceptor: Any) -> Found:
 
 def thetas(summary: Summary) -> list[float]:
     return [float(summary.theta_on), float(summary.theta_off)]
+
+
+def test_thresholds_from_rolling_frames_are_less_certain() -> None:
+    std = with_rolling_error(SUMMARY, STD, 0.01)
+    assert thetas(std) == pytest.approx([np.hypot(0.01, 0.016), np.hypot(0.02, 0.02)])
+    assert dataclasses.replace(std, theta_on=STD.theta_on, theta_off=STD.theta_off) == STD
+    assert thetas(with_rolling_error(SUMMARY, STD, 1.0))[0] == pytest.approx(0.0316, rel=0.01)
 
 
 def test_of_slow_pixels_the_networks_thresholds_are_lowered_and_count_less() -> None:

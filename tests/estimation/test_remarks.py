@@ -13,6 +13,7 @@ from evflow.estimation.refine.frame_exposure import UNSEEN, Exposure, Late
 from evflow.estimation.refine.frame_timing import UNTIMED, Timing
 from evflow.estimation.refine.receptor_result import OtherMap
 from evflow.estimation.remarks import receptor_notes, timing_notes
+from evflow.recordings.rolling import Rolling, Side
 from evflow.simulator.photoreceptor import Photoreceptor
 
 SUMMARY = Summary(*(np.float32(v) for v in (0.2, 0.25, 0.1, 0.1, 0.03, 0.03)))
@@ -83,11 +84,15 @@ def test_what_frame_times_are_wrong_by_is_told_and_stands_first(exposed_s: float
     assert timing_notes(Timing(UNSEEN), None) == []
 
 
-@pytest.mark.parametrize(("rolling_s", "way"), [(0.012, "later"), (-0.012, "earlier")])
-def test_a_rolling_shutter_is_told(rolling_s: float, way: str) -> None:
-    note, = timing_notes(UNTIMED._replace(rolling_s=rolling_s), Optics(0.0, -4e-3, 1.0, 1e-4))
+@pytest.mark.parametrize(("first", "options"), [
+    ("top", "--rolling-ms 12.3, or auto"),
+    ("right", "--rolling-ms 12.3 --rolling-from right, or auto")])
+def test_a_rolling_shutter_is_told(first: Side, options: str) -> None:
+    timing = UNTIMED._replace(rolling=Rolling(0.0123, first))
+    note, = timing_notes(timing, Optics(0.0, -4e-3, 1.0, 1e-4))
     assert note.code == "frames.rolling"
-    assert f"the bottom of the frames is 12 ms {way} than their top" in note.text
+    assert f"frames were read from the {first}" in note.text
+    assert options in note.text
 
 
 @pytest.mark.parametrize("sought", [True, False])

@@ -3,7 +3,7 @@
 Slow pixels delay events too, but they also blur them: to second order, a low-pass of time constant
 tau has a delay of tau and takes 12 tau^2 off the square of the frames' exposure. And most are
 slower in the dark. What neither explains of the delay is an error of the frame times. If it grows
-from row to row, the frames are read row by row (a rolling shutter).
+from row to row, or from column to column, so the frames are read (a rolling shutter).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ LEAST_LATE_US = 4000.0  # beyond slow pixels, as far as their blur and the dark 
 OPEN = 0.5  # share of it that a time constant may be longer than its blur tells: long ones are
 SLOW = 12.0  # square of the length over that of the delay, of a low-pass of first order
 TOLERANCE = 1.1  # of the interval between frames, which no exposure exceeds
-LEAST_ROLLING_US, CLEARLY_ROLLING = 5000.0, 5.0  # from top to bottom; in std
+LEAST_ROLLING_US, CLEARLY_ROLLING = 5000.0, 5.0  # from side to side; in std
 
 WithError = tuple[float, float]  # value and error
 
@@ -65,7 +65,7 @@ def late(seen: Seen, interval_us: float) -> tuple[float, Late]:
                          1e-6 * min(alike_us, interval_us) * possible)
 
 
-def rolling(sloping_us: float, error_us: float) -> bool:
-    """Whether the delay grows from the frames' top to their bottom by so much as if they were read
-    row by row."""
+def is_rolling(sloping_us: float, error_us: float) -> bool:
+    """Whether the delay grows from one side of the frames to the other by so much as if they were
+    read row by row, or column by column."""
     return abs(sloping_us) > max(LEAST_ROLLING_US, CLEARLY_ROLLING * error_us)

@@ -21,11 +21,12 @@ import numpy as np
 
 from evflow.estimation.refine.between_events import changes
 from evflow.estimation.refine.busy import Busy, busy
-from evflow.estimation.refine.frame_clock import BIAS, CLEARLY, Seen, WithError, late, rolling
+from evflow.estimation.refine.frame_clock import BIAS, CLEARLY, Seen, WithError, is_rolling, late
 from evflow.estimation.refine.frame_exposure import ON_TIME, UNSEEN, Exposure, Late, is_untold
 from evflow.estimation.refine.path import Place
 from evflow.estimation.refine.receptor_data import TILES
 from evflow.light.log_maps import log64
+from evflow.recordings.rolling import GLOBAL, Rolling, Side
 from evflow.types import release
 
 Array = np.ndarray
@@ -46,6 +47,7 @@ UNEQUAL = 0.05  # of a threshold, below which the other polarity foretells nothi
 NOTHING = 1e-9  # of the sums, so that one polarity alone, or no change, can be solved
 FEWEST, FEWEST_LENGTHS = 4, 3  # tiles, over which a length's scatter says something; lengths
 FLOOR_S = 2.5e-3  # std beside the scatter, of simulated cameras exposed for 10 and 20 ms
+SIDES: tuple[tuple[Side, Side], ...] = (("top", "bottom"), ("left", "right"))
 # Columns of products: changes that neighbours show; ON and minus OFF of the pixels; their frames.
 AROUND, OWN, FRAMES = slice(0, 4), slice(4, 6), slice(6, 7)
 SOLVED = slice(4, 7)  # by least squares
@@ -53,13 +55,13 @@ SOLVED = slice(4, 7)  # by least squares
 
 class Timing(NamedTuple):
     """exposure: of the frames, where it is untold; late: of the events behind the frames, where
-    slow pixels do not explain it; left_s: what they leave of it, however little; rolling_s: by
-    which the frames' bottom is later than their top; 0 if it is unknown."""
+    slow pixels do not explain it; left_s: what they leave of it, however little, 0 if it is
+    unknown; rolling: how the frames are read, where that is clear, and nothing else then."""
 
     exposure: Exposure = UNSEEN
     late: Late = ON_TIME
     left_s: float = 0.0
-    rolling_s: float = 0.0
+    rolling: Rolling = GLOBAL
 
 
 UNTIMED = Timing()
@@ -85,8 +87,8 @@ def frame_timing(places: Sequence[Place]) -> Timing:
     fits = _fits(runs, lengths, *about) if about else None
     if fits is None:
         return UNTIMED
-    if rolling(*fits.sloping_us):
-        return UNTIMED._replace(rolling_s=1e-6 * fits.rolling_us)
+    if fits.rolling != GLOBAL:
+        return UNTIMED._replace(rolling=fits.rolling)
     misfits = fits.misfits
     explains = misfits[len(SHARPER)] > EXPLAINS * misfits.min() and (
         int(np.argmin(misfits)) < len(misfits) - 1)  # longer ones may do so better
@@ -110,15 +112,13 @@ def _about(runs: Sequence[Busy], middle_us: float) -> tuple[int, float] | None:
 
 class Fits(NamedTuple):
     """Values and their errors: delay_us, of the events; darker_us, how much longer it is in the
-    darker half; square, of the exposure's length; sloping_us, how much longer the delay is at the
-    bottom. rolling_us: the last, where it is more than the delays that were tried first. misfits:
-    of SHARPER and the lengths."""
+    darker half; square, of the exposure's length. rolling: how the frames are read. misfits: of
+    SHARPER and the lengths."""
 
     delay_us: WithError
     darker_us: WithError
     square: WithError
-    sloping_us: WithError
-    rolling_us: float
+    rolling: Rolling
     misfits: Array
 
 
@@ -131,26 +131,29 @@ def _fits(runs: Sequence[Busy], lengths: Array, delay: int, offset: float) -> Fi
     used = np.flatnonzero(np.trace(table[0].sum(1), axis1=1, axis2=2))
     if len(used) < FEWEST or not _of_both(table[2].sum((0, 1))[SOLVED, SOLVED]):
         return None
-    row = np.tile(np.repeat(np.arange(TILES[0]), TILES[1]), len(runs))
-    slow = _slow_times(runs)
+    of_tiles = np.divmod(np.arange(TILES[0] * TILES[1]), TILES[1])  # their rows and columns
+    lines = np.stack([np.tile(of, len(runs)) for of in of_tiles])
+    slow = [_slow_times(runs, axis) for axis in (0, 1)]
 
-    def measured(products: Array, row: Array) -> Array:
+    def measured(products: Array, lines: Array) -> Array:
         of_delays = products[:len(at), ..., SOLVED, SOLVED]
         by_light = of_delays.sum(1)
         dark, bright = (_delay(at, by_light[:, k]) for k in (0, 1))
         return np.array([_delay(at, by_light.sum(1)), dark - bright,
                          _lowest(*_misfits(lengths, products[len(at):].sum((1, 2)))),
-                         _sloping(at, of_delays.sum(2), row, slow)])
+                         *map(_sloping, [at] * 2, [of_delays.sum(2)] * 2, lines, slow)])
 
-    best = measured(table, row)
-    without = [measured(np.delete(table, b, 1), np.delete(row, b)) for b in used]
+    best = measured(table, lines)
+    without = [measured(np.delete(table, b, 1), np.delete(lines, b, 1)) for b in used]
     error = np.sqrt((len(used) - 1) * np.var(without, 0))
-    delay_us, darker_us, square, sloping_us = zip(best.tolist(), error.tolist(), strict=True)
-    rolling_us = sloping_us[0]
-    if rolling(*sloping_us):
+    delay_us, darker_us, square, *sloping_us = zip(best.tolist(), error.tolist(), strict=True)
+    axis = int(np.argmax([abs(value) / (by + 1.0) for value, by in sloping_us]))
+    rolling = GLOBAL
+    if is_rolling(*sloping_us[axis]):  # by more than the delays that were tried, perhaps
         wide = _products(runs, [(middle, delay_us) for delay_us in DELAYS_US], at[2], offset)
-        rolling_us = _sloping(DELAYS_US, wide[..., SOLVED, SOLVED].sum(2), row, slow)
-    return Fits(delay_us, darker_us, square, sloping_us, rolling_us,
+        by_us = _sloping(DELAYS_US, wide[..., SOLVED, SOLVED].sum(2), lines[axis], slow[axis])
+        rolling = Rolling(1e-6 * abs(by_us), SIDES[axis][int(by_us < 0.0)])
+    return Fits(delay_us, darker_us, square, rolling,
                 _misfits(lengths, table[len(at):].sum((1, 2)))[1])
 
 
@@ -173,33 +176,34 @@ def _longer(runs: Sequence[Busy]) -> float:
     return 2.0 * (times[0] - times[1]) / (times[0] + times[1])
 
 
-def _slow_times(runs: Sequence[Busy]) -> Array:
-    """(TILES[0],) in which slow pixels would be late, relative to each other, row by row."""
-    rows = np.concatenate([run.block // 2 // TILES[1] for run in runs])
+def _slow_times(runs: Sequence[Busy], axis: int) -> Array:
+    """(TILES[axis],) in which slow pixels would be late, relative to each other, row by row or
+    column by column."""
+    lines = np.divmod(np.concatenate([run.block // 2 for run in runs]), TILES[1])[axis]
     dn = np.concatenate([0.5 * (run.before + run.after) for run in runs])
-    number = np.bincount(rows, minlength=TILES[0])
-    mean = np.bincount(rows, dn, TILES[0]) / np.maximum(number, 1)
+    number = np.bincount(lines, minlength=TILES[axis])
+    mean = np.bincount(lines, dn, TILES[axis]) / np.maximum(number, 1)
     times = 1.0 / (mean + KNEE)
     return times / times[number > 0].mean()
 
 
-def _sloping(at: Array, of_delays: Array, row: Array, slow: Array) -> float:
-    """How much longer the delay is at the bottom of the frames than at their top, beside what slow
-    pixels can explain: products (delays, blocks, 3, 3), and rows of the blocks."""
-    sums = [of_delays[:, row == k].sum(1) for k in range(TILES[0])]
+def _sloping(at: Array, of_delays: Array, lines: Array, slow: Array) -> float:
+    """How much longer the delay is on the last of some lines than on the first, beside what slow
+    pixels can explain: products (delays, blocks, 3, 3), lines (rows or columns) of the blocks."""
+    sums = [of_delays[:, lines == k].sum(1) for k in range(len(slow))]
     weight = np.array([np.trace(total[0]) for total in sums])
     delays = np.array([_delay(at, total) if w else 0.0
                        for w, total in zip(weight, sums, strict=True)])
-    down = np.arange(TILES[0]) / TILES[0]
+    along = np.arange(len(slow)) / len(slow)
 
     def fitted(values: Array, *columns: Array) -> Array:
         scale = np.sqrt(weight)
-        both = np.stack([np.ones(TILES[0]), *columns], 1) * scale[:, None]
+        both = np.stack([np.ones(len(slow)), *columns], 1) * scale[:, None]
         return np.linalg.lstsq(both, scale * values, rcond=None)[0]
 
     most = max(float(weight @ delays) / weight.sum(), 0.0)  # slow pixels explain no more than all
-    share = np.clip(fitted(delays, down, slow)[2], 0.0, most)
-    return float(fitted(delays - share * slow, down)[1])
+    share = np.clip(fitted(delays, along, slow)[2], 0.0, most)
+    return float(fitted(delays - share * slow, along)[1])
 
 
 def _of_frames(run: Busy, offset: float) -> Array:

@@ -33,9 +33,9 @@ def rolling(steps: Steps) -> Finding | None:
     return Finding(
         "EV024", "warning", f"the bottom of the frames is {abs(late) / 1e3:.0f} ms "
         f"{'earlier' if late > 0 else 'later'} than their top: a rolling shutter?",
-        "Frames show one time (global shutter) for a camera to be measured from them; else "
-        "thresholds come out too high where things move (by 5 to 17 % with 10 to 30 ms in "
-        "simulations). Record slower motion, or read the frames faster.")
+        "Pass --rolling-ms auto, or this time and the side that is read first, --rolling-from; "
+        "else thresholds come out too high where things move (by 5 to 17 % with 10 to 30 ms in "
+        "simulations).")
 
 
 def _bands(steps: Steps) -> list[tuple[float, np.ndarray]]:

@@ -14,7 +14,7 @@ from helpers.films import FRAME_S, INTERVALS, integrated, view
 from evflow import CameraEstimator, Recording, estimate_camera, read_recording
 from evflow.camera.optics import read_sensor
 from evflow.estimation import front_end
-from evflow.estimation.clock import aligned
+from evflow.estimation.clock import aligned, rolling
 from evflow.estimation.dead_time import DeadTime
 from evflow.estimation.refine import between_events, busy
 from evflow.estimation.refine import frame_timing as frame_timing_module
@@ -31,6 +31,7 @@ from evflow.estimation.refine.path import STEPS
 from evflow.estimation.refine.stretches import cut
 from evflow.notes import Note
 from evflow.recordings import adjust
+from evflow.recordings.rolling import GLOBAL, Side, unrolled
 from evflow.recordings.windows import plan_windows
 from evflow.types import Events
 
@@ -169,19 +170,34 @@ def test_times_that_are_wrong_by_nearly_half_an_interval_are_aligned() -> None:
     np.testing.assert_allclose(found.frame_times, recording.frame_times, atol=600)
 
 
-@pytest.mark.parametrize("steps", [8, -16])
-@pytest.mark.parametrize("tau_s", [0.0, 4e-3])
-def test_frames_that_are_read_row_by_row_show(steps: int, tau_s: float) -> None:
-    """By 10 and -20 ms; and are not taken for exposed ones, or late."""
-    recording = blurred(0, tau_s=tau_s)
-    dn = view(2)
-    rows = np.linspace(-0.5, 0.5, dn.shape[1]) * steps
+def rolled(steps: int, first: Side, tau_s: float = 0.0) -> Recording:
+    """`blurred(0)`, with frames that are read in so many steps."""
+    recording, dn = blurred(0, tau_s=tau_s), view(2)
+    axis, sign = {"top": (1, 1), "bottom": (1, -1), "left": (2, 1), "right": (2, -1)}[first]
+    dn = np.moveaxis(dn, axis, 1)
+    late = np.round(np.linspace(-0.5, 0.5, dn.shape[1]) * sign * steps).astype(int)
     middle = np.round(recording.frame_times / STEP_US).astype(int)
-    rolled = np.stack([[dn[k + round(row), y] for y, row in enumerate(rows)] for k in middle])
-    found = frame_timing([(dataclasses.replace(
-        recording, frames=np.rint(rolled).astype(np.uint8)), RUN)])
-    assert found.rolling_s == pytest.approx(1e-6 * steps * STEP_US, rel=0.12)
+    frames = np.stack([dn[k + late, np.arange(len(late))] for k in middle])
+    return dataclasses.replace(
+        recording, frames=np.rint(np.moveaxis(frames, 1, axis)).astype(np.uint8))
+
+
+@pytest.mark.parametrize(("steps", "first"), [
+    (8, "top"), (16, "bottom"), (8, "right"), (12, "left")])
+@pytest.mark.parametrize("tau_s", [0.0, 4e-3])
+def test_frames_that_are_read_row_by_row_show(steps: int, first: Side, tau_s: float) -> None:
+    """In 10 to 20 ms; and are not taken for exposed ones, or late."""
+    found = frame_timing([(rolled(steps, first, tau_s), RUN)])
+    assert found.rolling == (pytest.approx(1e-6 * steps * STEP_US, rel=0.12), first)
     assert found[:2] == UNTIMED[:2]
+
+
+@pytest.mark.parametrize("first", ["top", "right"])
+def test_what_the_events_tell_of_it_can_be_undone(first: Side) -> None:
+    recording = rolled(12, first)
+    found = rolling(recording)
+    assert frame_timing([(unrolled(recording, found), RUN[2:-2])]).rolling == GLOBAL
+    assert rolling(unrolled(recording, found)) == GLOBAL == rolling(blurred(0))
 
 
 def test_what_slow_pixels_explain_from_row_to_row_is_not_rolling() -> None:
@@ -301,6 +317,15 @@ def test_an_estimate_takes_the_blur_out_and_says_so(tmp_path: Path) -> None:
     assert estimator.estimate().optics == found.optics
     ideal = estimate_camera(recording, pixel="ideal")
     assert ideal.optics.exposure_s == 0
+
+
+def test_what_cannot_be_trusted_of_rolling_frames_is_in_the_errors() -> None:
+    recording = rolled(16, "top")
+    (as_it_is, std), (undone, certain) = (
+        (found.summary, found.summary_std) for found in map(
+            estimate_camera, (recording, unrolled(recording, rolling(recording)))))
+    assert abs(undone.theta_on - 0.1) < 2 * certain.theta_on < 0.02 < 2 * std.theta_on
+    assert abs(as_it_is.theta_on - 0.1) < 2 * std.theta_on
 
 
 def test_events_that_wait_are_not_taken_for_a_blur(monkeypatch: pytest.MonkeyPatch) -> None:

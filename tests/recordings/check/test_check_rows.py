@@ -62,3 +62,4 @@ def test_an_offset_is_told_beside_it(moving: Recording) -> None:
     assert [f.code for f in findings] == ["EV024", "EV024"]
     assert "--frames-offset-ms" in findings[0].fix
     assert "rolling shutter" in findings[1].seen
+    assert "--rolling-ms auto" in findings[1].fix
