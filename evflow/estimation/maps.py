@@ -23,7 +23,6 @@ from evflow.estimation.refine import (
     pixel_posterior,
     refine_summary,
 )
-from evflow.estimation.refine.receptor_result import OtherMap
 from evflow.network import api
 from evflow.network.coordinates import SCALE, per_channel, unsquash_summary
 from evflow.network.posterior import Evidence, evidence, posterior
@@ -175,14 +174,14 @@ def refined(
     params: api.Params, chunks: list[Chunk], summary: Summary, std: Summary, front_end: FrontEnd
 ) -> tuple[Summary, Summary, Optics | None]:
     """The summary and its std after refinement, and the optics that agree with it. What the log map
-    leaves open widens the std, and not the optics."""
+    and an offset leave open widens the std, and not the optics."""
     parts = next(iter(params.values()))
     fusion, found = parts.get("fusion"), front_end.found
     refined = refine_summary(chunks, summary, std, fusion, parts.get("signal"),
                              found=found, noise_dn=front_end.noise_dn, blur_s=front_end.blur_s)
     if found is None:
         return refined.summary, refined.std, None
-    std = _with_map_open(refined.summary, refined.std, found.other_map)
+    std = _with_open(refined.summary, refined.std, found)
     if fusion is None:
         return refined.summary, std, found.optics
     theta, stepped, error = (np.array([s.theta_on, s.theta_off], np.float64)
@@ -191,12 +190,14 @@ def refined(
     return refined.summary, std, found.optics_given(float(change), float(relative))
 
 
-def _with_map_open(summary: Summary, std: Summary, other: OtherMap | None) -> Summary:
-    """The std with the error of thresholds by a log map that may be another one."""
-    if other is None:
-        return std
+def _with_open(summary: Summary, std: Summary, found: Found) -> Summary:
+    """The std with the errors of thresholds by a log map that may be another one, and by an offset
+    that may be there."""
+    errors = found.offset_open
+    if found.other_map is not None:
+        errors = np.hypot(errors, found.other_map.theta_error)
     wider = {name: jnp.hypot(getattr(std, name), np.float32(error) * getattr(summary, name))
-             for name, error in zip(("theta_on", "theta_off"), other.theta_error, strict=True)}
+             for name, error in zip(("theta_on", "theta_off"), errors, strict=True)}
     return dataclasses.replace(std, **wider)
 
 

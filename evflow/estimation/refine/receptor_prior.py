@@ -15,6 +15,7 @@ Array = np.ndarray
 
 PRIOR = np.array([25.0, 5e-3, 8e-4])  # std of offset (DN), tau and delay (s) before any data
 MISLED = 0.05  # share of cameras whose net changes give a wrong offset
+BIASED = 3.5  # DN, by which a path finds offsets too large or small, however sharply
 DOUBT = 6.0  # log odds for an ideal camera: a priori, and for the volume of the three constants
 # A short recording of few pixels shows few motions, and the path's errors differ for each. Of 41
 # ideal cameras of 64x64 pixels, recorded for .05 to .2 s, 14 would be found not ideal with DOUBT
@@ -82,6 +83,12 @@ class Prior:
 
 def _density(away: float, std: float) -> float:
     return float(np.exp(-0.5 * (away / std) ** 2) / std)
+
+
+def beyond_bias(gain: float, offset_dn: float) -> float:
+    """Log odds by which a path says that there is this offset and not none: the gain of its
+    likelihood, and no more than if it knew the offset with an error of BIASED."""
+    return min(gain, 0.5 * (offset_dn / BIASED) ** 2)
 
 
 def small_sample_odds(data: Sample) -> float:

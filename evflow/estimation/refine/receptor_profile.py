@@ -1,9 +1,9 @@
 """Errors of the photoreceptor's constants where the likelihood is not a parabola.
 
-Two sources. Along the offset (with the best tau and delay at each): the lin-log's knee bends the
+Three sources. Along the offset (with the best tau and delay at each): the lin-log's knee bends the
 likelihood, which is far flatter towards more light than its curvature at the maximum says, and a
 threshold depends on the offset's logarithm. Between the two laws of the low-pass: the less probable
-may be the true one.
+may be the true one. And an offset may be there where none was found.
 """
 
 from __future__ import annotations
@@ -13,12 +13,15 @@ from collections.abc import Callable
 
 import numpy as np
 
+from evflow.estimation.refine.receptor_descent import OFFSET, PLAIN
+from evflow.estimation.refine.receptor_prior import Prior, beyond_bias
 from evflow.estimation.refine.receptor_regression import Regression
 
 Array = np.ndarray
 
 WALK = (1.0, 1.0, 1.0, 2.0, 2.0, 4.0)  # steps to each side, in std of the offset
 SHORTEST, LONGEST = 1.5, 6.0  # DN, limits of that std
+POSSIBLE = np.arange(-24.0, 61.0, 4.0)  # DN, of an offset that was not found
 FAR = 5.0  # drop of the log-likelihood at which a walk ends
 
 
@@ -83,3 +86,18 @@ def along_offset(
     weight = np.gradient(offset) * np.exp(worse.min() - worse)
     weight /= weight.sum()
     return float(weight @ offset**2), np.array([weight @ a**2 for a in away])
+
+
+def offset_open(model: Regression, size: float) -> Array:
+    """(2,) relative errors of an ideal pixel's theta, as there may be an offset after all: as if
+    every second camera had one. size: effective number of events that count as evidence."""
+    none = -0.5 * size * model.unexplained(PLAIN)
+    log_odds, away = [], []
+    for offset in POSSIBLE:
+        at = np.where(OFFSET, offset, PLAIN)
+        gain = beyond_bias(-0.5 * size * model.unexplained(at) - none, float(offset))
+        log_odds.append(gain - Prior().minus_log(at) + model.prior.log_odds(float(offset)))
+        away.append(np.log(np.abs(model.solved(at)[0] / model.solved(PLAIN)[0])))
+    weight = np.exp(np.minimum(log_odds, 50.0)) / np.exp(
+        [-Prior().minus_log(np.where(OFFSET, offset, PLAIN)) for offset in POSSIBLE]).sum()
+    return np.asarray(np.sqrt(weight @ np.square(away) / (1.0 + weight.sum())))

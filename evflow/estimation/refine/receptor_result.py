@@ -50,7 +50,8 @@ class Found:
     events; smear: (2, 3) for each of SMEARS, gain of log unexplained share when counts are averaged
     over it, and changes of log theta_on and log theta_off; curve: (K, 2) CUTOFFS in Hz, and the
     share explained with each, offset and delay as found; other_map: None where the maps do not
-    differ."""
+    differ; offset_open: (2,) relative errors of the ideal pixel's theta due to an offset that may
+    be there, 0 where it is not ideal."""
 
     seen: Photoreceptor
     theta: np.ndarray
@@ -64,6 +65,7 @@ class Found:
     smear: np.ndarray
     curve: np.ndarray
     other_map: OtherMap | None = None
+    offset_open: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(2))
 
     @property
     def std(self) -> np.ndarray:
