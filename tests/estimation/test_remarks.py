@@ -24,11 +24,11 @@ def told(
     offset_dn: float, std_dn: float, due: float, log_map: LogMap = "linlog",
     other: OtherMap | None = None,
 ) -> dict[str, str]:
-    """The notes, by code, where the constants' errors alone change theta by the share `due`."""
+    """The notes, by code, where what is open of the offset changes theta by the share `due`."""
     seen = Photoreceptor(offset_dn, log_map=log_map)
     found = Found(
         seen, np.full(2, 0.3), np.full(2, 0.3), np.diag([std_dn**2, 1e-8, 1e-8]), np.full(2, due),
-        (0.9, 0.9), 0.1, 0.0, 400.0, np.zeros((2, 3)), np.zeros((2, 2)), other)
+        (0.9, 0.9), 0.1, 0.0, 400.0, np.zeros((2, 3)), np.zeros((2, 2)), other, np.full(2, due))
     optics = Optics(offset_dn, 0.0, std_dn, 1e-4)
     return {note.code: note.text
             for note in receptor_notes(found, optics, SUMMARY, STD, sought=True)}

@@ -139,10 +139,11 @@ def _offset_by_net(model: Regression, size: float, plain: float) -> tuple[np.nda
 
 def _offset_by_path(model: Regression, size: float, plain: float) -> tuple[np.ndarray, float]:
     """The same with the offset by which a path that is nearly right explains the events best."""
-    clean = np.clip((1.0 - np.exp(plain) - CLEAN) / (CLEANER - CLEAN), 0.0, 1.0)
+    phi = descend(PLAIN, model, TRUSTED * size, OFFSET)
+    left = model.unexplained(phi)
+    clean = np.clip((1.0 - np.exp(left) - CLEAN) / (CLEANER - CLEAN), 0.0, 1.0)
     size *= float(1.0 + (TRUSTED - 1.0) * clean)
-    phi = descend(PLAIN, model, size, OFFSET)
-    gain = beyond_bias(0.5 * size * (plain - model.unexplained(phi)), float(phi[0]))
+    gain = beyond_bias(0.5 * size * (plain - left), float(phi[0]))
     gain -= BY_PATH + small_sample_odds(model.data)
     return phi, _given_prior(gain, phi, model) if clean else -np.inf
 

@@ -8,7 +8,8 @@ import pytest
 from evflow.estimation.refine import receptor_noise
 from evflow.estimation.refine.receptor_data import Sample
 from evflow.estimation.refine.receptor_noise import split_at_noise
-from evflow.estimation.refine.receptor_profile import along_offset
+from evflow.estimation.refine.receptor_prior import Prior
+from evflow.estimation.refine.receptor_profile import along_offset, offset_open
 from evflow.estimation.refine.sightings import sight
 from evflow.estimation.refine.still_noise import noise_rates
 from evflow.simulator.photoreceptor import IDEAL, Photoreceptor
@@ -86,7 +87,16 @@ def test_thresholds_that_noise_makes_small_do_not_explain_it(
 
 
 class Bent:
-    """A regression whose thresholds go with the offset, e-fold in 50 DN and 25 DN."""
+    """A regression whose thresholds go with the offset, e-fold in 50 DN and 25 DN, and which says
+    nothing of it, or that there is none."""
+
+    prior = Prior()
+
+    def __init__(self, sharp: float = 0.0) -> None:
+        self.sharp = sharp
+
+    def unexplained(self, phi: np.ndarray) -> float:
+        return self.sharp * float(phi[0]) ** 2
 
     def solved(self, phi: np.ndarray) -> tuple[np.ndarray, float, float]:
         return np.exp(np.array([-0.02, -0.04]) * phi[0]), 0.0, 1.0
@@ -105,3 +115,13 @@ def test_how_far_the_offset_goes_is_read_off_the_likelihood(above: float) -> Non
     expected = 4.0 * (1 + above**3) / (1 + above)
     assert square == pytest.approx(expected, rel=0.15)
     np.testing.assert_allclose(np.sqrt(thetas / square), [0.02, 0.04], rtol=1e-6)
+
+
+def test_an_offset_of_which_nothing_is_known_is_in_the_errors() -> None:
+    """By half, as of every second camera."""
+    one, other = offset_open(Bent(), 400.0)  # type: ignore[arg-type]
+    assert other == pytest.approx(2 * one)
+    offsets = np.random.default_rng(0).normal(0, 25.0, 100_000)
+    offsets = offsets[(offsets > -26) & (offsets < 62)]
+    assert one == pytest.approx(0.02 * np.sqrt(0.5 * (offsets**2).mean()), rel=0.02)
+    assert offset_open(Bent(1.0), 400.0).max() < 1e-3  # type: ignore[arg-type]

@@ -22,7 +22,13 @@ from helpers.samples import NONE_HOT, looked_at, no_readouts
 from evflow.estimation.refine import receptor_descent, receptor_prior, receptor_search
 from evflow.estimation.refine.path import STEPS
 from evflow.estimation.refine.receptor_data import Sample, sample
-from evflow.estimation.refine.receptor_prior import FEW, FEWER, small_sample_odds
+from evflow.estimation.refine.receptor_prior import (
+    FEW,
+    FEWER,
+    Prior,
+    beyond_bias,
+    small_sample_odds,
+)
 from evflow.estimation.refine.receptor_profile import Other
 from evflow.estimation.refine.receptor_regression import Regression
 from evflow.estimation.refine.receptor_result import TRADED
@@ -124,6 +130,48 @@ def test_an_offset_must_explain_something(
     assert found.needed
     assert found.seen.offset_dn == (pytest.approx(24.0, abs=4.0) if kept else 0.0)
     assert found.covariance[0, 0] > (0.0 if kept else 15.0**2)
+
+
+@pytest.mark.parametrize("offset", [-14.0, 24.0])
+def test_a_good_path_shows_an_offset_by_itself(
+    monkeypatch: pytest.MonkeyPatch, offset: float
+) -> None:
+    """Of which all three constants together are no evidence, nor net changes."""
+    for name in ("DOUBT", "ALONE"):
+        monkeypatch.setattr(receptor_search, name, 1e6)
+    monkeypatch.setattr(receptor_prior, "FEW", 1.0)
+    found = find(looked_at(offset, 0.0))
+    assert found.needed
+    assert found.used.offset_dn == pytest.approx(offset, abs=3.0)
+    assert found.used.tau_s == 0.0
+    assert not found.offset_open.any()
+    monkeypatch.setattr(receptor_search, "BY_PATH", 1e6)
+    found = find(looked_at(offset, 0.0))
+    assert not found.needed
+    assert (found.offset_open > 0.05).all()
+
+
+def test_what_a_path_says_of_an_offset_is_worth_more_the_better_it_is() -> None:
+    data = looked_at(24.0, 0.0)
+    off = np.random.default_rng(0).normal(0, 2.0, (2, *np.shape(data.on))).astype(np.float32)
+    clear, poor = (Regression(one) for one in (
+        data, data._replace(on=data.on + off[0], off=data.off + off[1])))
+    none = np.array([0.0, FAST, 0.0])
+    phi, odds = receptor_search._offset_by_path(clear, 2.0, clear.unexplained(none))
+    assert phi[1:] == pytest.approx(none[1:])
+    gain = 0.5 * 10.0 * (clear.unexplained(none) - clear.unexplained(phi))
+    bound = 0.5 * (phi[0] / receptor_prior.BIASED) ** 2
+    gain = min(gain, bound)
+    rest = clear.prior.log_odds(float(phi[0])) - Prior().minus_log(phi)
+    assert odds == pytest.approx(
+        gain - receptor_search.BY_PATH - small_sample_odds(data) + rest)
+    assert receptor_search._offset_by_path(poor, 2.0, poor.unexplained(none))[1] == -np.inf
+
+
+@pytest.mark.parametrize(("gain", "offset", "odds"), [
+    (3.0, 35.0, 3.0), (60.0, 35.0, 50.0), (3.0, -3.5, 0.5), (-2.0, 3.5, -2.0)])
+def test_a_small_offset_may_be_a_bias_of_the_path(gain: float, offset: float, odds: float) -> None:
+    assert beyond_bias(gain, offset) == pytest.approx(odds)
 
 
 def test_a_slow_pixel_is_found_among_noise() -> None:
