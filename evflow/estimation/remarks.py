@@ -17,6 +17,7 @@ from evflow.recordings.check.contents import ACTIVE_SHARE, VALID_EVENTS
 from evflow.training.config import PRESETS
 
 OPEN = 0.5  # of the stated error of theta: what is told to be open is so much of it
+UNDETERMINED = 2.0  # times it: what an offset that was found may be wrong by is told
 FEW_EVENTS = 200  # of a polarity: with fewer its threshold is called uncertain
 
 BOUND_S = 3.8e-3  # delays beyond which a search is at its bound
@@ -110,14 +111,14 @@ def receptor_notes(
             "frames show (dark current, black level): the thresholds refer to that light. A gamma "
             "of the frames cannot be recognised in a single recording."))
         return notes
-    if (due := float((found.theta_error if found.needed else found.offset_open).mean())) > (
-            OPEN * stated):
+    open_, bound = (found.theta_error, UNDETERMINED) if found.needed else (found.offset_open, OPEN)
+    if (due := float(open_.mean())) > bound * stated:
         notes.append(Note(
             "frames.offset", "how much more light the pixels see than the frames show is hardly "
             f"determined ({optics.offset_dn:.0f} ± {optics.offset_dn_std:.0f} DN), and by itself "
-            f"changes the thresholds by {due:.0%}. Their errors allow for it as if every second "
-            "camera had such light; two real DAVIS had 18 and 24 DN. A longer recording, with dark "
-            "and bright areas, determines it."))
+            f"changes the thresholds by {due:.0%}. Where none was found, their errors allow for "
+            "one as if every second camera had it; two real DAVIS had 18 and 24 DN. A longer "
+            "recording, with dark and bright areas, determines it."))
     return notes
 
 
