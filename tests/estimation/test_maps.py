@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from evflow.camera import Camera, Summary
+from evflow.estimation import maps
 from evflow.estimation.maps import (
     SLOW_BIAS,
     regressed,
@@ -17,7 +18,7 @@ from evflow.estimation.maps import (
     with_rolling_error,
 )
 from evflow.estimation.refine import Lost
-from evflow.estimation.refine.receptor_result import STEPPED_LOW, Found
+from evflow.estimation.refine.receptor_result import STEPPED_LOW, Found, OtherMap
 from evflow.simulator.photoreceptor import TYPICAL, Photoreceptor
 
 SUMMARY = Summary(*(np.float32(v) for v in (0.2, 0.25, 0.1, 0.1, 0.03, 0.03)))
@@ -40,6 +41,17 @@ def test_thresholds_from_rolling_frames_are_less_certain() -> None:
     assert thetas(std) == pytest.approx([np.hypot(0.01, 0.016), np.hypot(0.02, 0.02)])
     assert dataclasses.replace(std, theta_on=STD.theta_on, theta_off=STD.theta_off) == STD
     assert thetas(with_rolling_error(SUMMARY, STD, 1.0))[0] == pytest.approx(0.0316, rel=0.01)
+
+
+def test_what_is_open_of_offset_and_map_is_in_the_errors_of_thresholds() -> None:
+    ideal = found(0.9)
+    assert thetas(maps._with_open(SUMMARY, STD, ideal)) == pytest.approx([0.01, 0.02])
+    open_ = dataclasses.replace(ideal, offset_open=np.array([0.05, 0.08]))
+    assert thetas(maps._with_open(SUMMARY, STD, open_)) == pytest.approx(
+        [np.hypot(0.01, 0.01), np.hypot(0.02, 0.02)])
+    both = dataclasses.replace(open_, other_map=OtherMap(0.25, np.exp([0.1, 0.0])))
+    assert thetas(maps._with_open(SUMMARY, STD, both)) == pytest.approx(
+        [np.sqrt(2e-4 + 1e-4), np.hypot(0.02, 0.02)], rel=1e-5)
 
 
 def test_of_slow_pixels_the_networks_thresholds_are_lowered_and_count_less() -> None:
