@@ -102,7 +102,8 @@ def receptor_notes(
         notes.append(LOGARITHMIC)
     stated = np.mean([float(std.theta_on) / float(summary.theta_on),
                       float(std.theta_off) / float(summary.theta_off)])
-    if found.other_map is not None and found.other_map.theta_error.mean() > OPEN * stated:
+    beside = np.sqrt(max(stated**2 - found.offset_open.mean() ** 2, 0.0))
+    if found.other_map is not None and found.other_map.theta_error.mean() > OPEN * beside:
         notes.append(map_note(found.other_map, found.seen.logarithmic))
     if abs(optics.offset_dn) > 2.0 * optics.offset_dn_std:
         more = "more" if optics.offset_dn > 0 else "less"
