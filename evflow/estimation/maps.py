@@ -132,10 +132,7 @@ def with_unquiet_error(
 def with_rolling_error(summary: Summary, std: Summary, seconds: float) -> Summary:
     """The std, that of thresholds larger if this is the time from the first row of a frame to the
     last."""
-    added = min(ROLLING * seconds, ROLLING_MOST)
-    theta = {name: jnp.hypot(getattr(std, name), added * getattr(summary, name))
-             for name in ("theta_on", "theta_off")}
-    return dataclasses.replace(std, **theta)
+    return _wider(summary, std, np.full(2, min(ROLLING * seconds, ROLLING_MOST)))
 
 
 def with_contrast_lost(
@@ -196,6 +193,11 @@ def _with_open(summary: Summary, std: Summary, found: Found) -> Summary:
     errors = found.offset_open
     if found.other_map is not None:
         errors = np.hypot(errors, found.other_map.theta_error)
+    return _wider(summary, std, errors)
+
+
+def _wider(summary: Summary, std: Summary, errors: np.ndarray) -> Summary:
+    """The std with further relative errors (2,) of the thresholds."""
     wider = {name: jnp.hypot(getattr(std, name), np.float32(error) * getattr(summary, name))
              for name, error in zip(("theta_on", "theta_off"), errors, strict=True)}
     return dataclasses.replace(std, **wider)

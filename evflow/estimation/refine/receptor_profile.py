@@ -91,13 +91,16 @@ def along_offset(
 def offset_open(model: Regression, size: float) -> Array:
     """(2,) relative errors of an ideal pixel's theta, as there may be an offset after all: as if
     every second camera had one. size: effective number of events that count as evidence."""
-    none = -0.5 * size * model.unexplained(PLAIN)
-    log_odds, away = [], []
+    ideal, none = model.solved(PLAIN)[0], -0.5 * size * model.unexplained(PLAIN)
+    usual, log_odds, away = [], [], []
     for offset in POSSIBLE:
         at = np.where(OFFSET, offset, PLAIN)
+        theta = model.solved(at)[0]
+        is_possible = min(theta.min(), ideal.min()) > 0
         gain = beyond_bias(-0.5 * size * model.unexplained(at) - none, float(offset))
-        log_odds.append(gain - Prior().minus_log(at) + model.prior.log_odds(float(offset)))
-        away.append(np.log(np.abs(model.solved(at)[0] / model.solved(PLAIN)[0])))
-    weight = np.exp(np.minimum(log_odds, 50.0)) / np.exp(
-        [-Prior().minus_log(np.where(OFFSET, offset, PLAIN)) for offset in POSSIBLE]).sum()
+        usual.append(-Prior().minus_log(at))
+        log_odds.append(gain + usual[-1] + model.prior.log_odds(float(offset)) if is_possible
+                        else -np.inf)
+        away.append(np.log(theta / ideal) if is_possible else np.zeros(2))
+    weight = np.exp(np.minimum(log_odds, 50.0)) / np.exp(usual).sum()
     return np.asarray(np.sqrt(weight @ np.square(away) / (1.0 + weight.sum())))

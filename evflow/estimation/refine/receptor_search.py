@@ -123,6 +123,7 @@ def _odds(phi: np.ndarray, model: Regression, size: float, plain: float) -> floa
 
 
 def _given_prior(gain: float, phi: np.ndarray, model: Regression) -> float:
+    """Log odds of the constants, by their gain and what was known of them before."""
     return gain - Prior().minus_log(phi) + model.prior.log_odds(float(phi[0]))
 
 

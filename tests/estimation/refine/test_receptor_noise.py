@@ -125,3 +125,14 @@ def test_an_offset_of_which_nothing_is_known_is_in_the_errors() -> None:
     offsets = offsets[(offsets > -26) & (offsets < 62)]
     assert one == pytest.approx(0.02 * np.sqrt(0.5 * (offsets**2).mean()), rel=0.02)
     assert offset_open(Bent(1.0), 400.0).max() < 1e-3  # type: ignore[arg-type]
+
+
+def test_an_offset_at_which_brightness_falls_with_on_events_is_none() -> None:
+    class Falling(Bent):
+        def solved(self, phi: np.ndarray) -> tuple[np.ndarray, float, float]:
+            theta, *rest = super().solved(phi)
+            return theta * np.where([phi[0] > 20.0, phi[0] < -15.0], [0.0, -1.0], 1.0), *rest
+
+    errors = offset_open(Falling(), 400.0)  # type: ignore[arg-type]
+    assert (errors > 0.0).all()
+    assert (errors < offset_open(Bent(), 400.0)).all()  # type: ignore[arg-type]
