@@ -101,6 +101,7 @@ NOTES: dict[str, str] = {
     "pixels.fast": "the photoreceptor's cutoff is too high to be measured",
     "pixels.hot": "pixels fire without a signal",
     "pixels.log": "the pixels' response is logarithmic in dim light too",
+    "pixels.losing": "pixels may lose contrast in a dead time",
     "pixels.lost": "pixels lose contrast in their dead time",
     "pixels.map": "which logarithm the pixels have in dim light is open",
     "pixels.open": "whether pixels are slow was not measured",

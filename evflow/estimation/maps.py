@@ -170,8 +170,8 @@ def _divided(
 def refined(
     params: api.Params, chunks: list[Chunk], summary: Summary, std: Summary, front_end: FrontEnd
 ) -> tuple[Summary, Summary, Optics | None]:
-    """The summary and its std after refinement, and the optics that agree with it. What the log map
-    and an offset leave open widens the std, and not the optics."""
+    """The summary and its std after refinement, and the optics that agree with it. What the log
+    map, an offset and a dead time leave open widens the std, and not the optics."""
     parts = next(iter(params.values()))
     fusion, found = parts.get("fusion"), front_end.found
     refined = refine_summary(chunks, summary, std, fusion, parts.get("signal"),
@@ -188,9 +188,9 @@ def refined(
 
 
 def _with_open(summary: Summary, std: Summary, found: Found) -> Summary:
-    """The std with the errors of thresholds by a log map that may be another one, and by an offset
-    that may be there."""
-    errors = found.offset_open
+    """The std with the errors of thresholds by a log map that may be another one, by an offset that
+    may be there, and by contrast that may be lost in a dead time."""
+    errors = np.hypot(found.offset_open, found.loss_open)
     if found.other_map is not None:
         errors = np.hypot(errors, found.other_map.theta_error)
     return _wider(summary, std, errors)

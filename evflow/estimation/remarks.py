@@ -102,9 +102,15 @@ def receptor_notes(
         notes.append(LOGARITHMIC)
     stated = np.mean([float(std.theta_on) / float(summary.theta_on),
                       float(std.theta_off) / float(summary.theta_off)])
-    beside = np.sqrt(max(stated**2 - found.offset_open.mean() ** 2, 0.0))
+    open_ = np.hypot(found.offset_open.mean(), found.loss_open.mean())
+    beside = np.sqrt(max(stated**2 - open_**2, 0.0))
     if found.other_map is not None and found.other_map.theta_error.mean() > OPEN * beside:
         notes.append(map_note(found.other_map, found.seen.logarithmic))
+    if (due := float(found.loss_open.mean())) > OPEN * stated:
+        notes.append(Note(
+            "pixels.losing", "pixels may lose contrast in a dead time, which is not certain enough "
+            f"to be taken out: thresholds would be some {due:.0%} lower, which their errors "
+            "include. A recording with more fast motion of clear contrast tells."))
     if abs(optics.offset_dn) > 2.0 * optics.offset_dn_std:
         more = "more" if optics.offset_dn > 0 else "less"
         notes.append(Note(
@@ -112,8 +118,8 @@ def receptor_notes(
             "frames show (dark current, black level): the thresholds refer to that light. A gamma "
             "of the frames cannot be recognised in a single recording."))
         return notes
-    open_, bound = (found.theta_error, UNDETERMINED) if found.needed else (found.offset_open, OPEN)
-    if (due := float(open_.mean())) > bound * stated:
+    errors, bound = (found.theta_error, UNDETERMINED) if found.needed else (found.offset_open, OPEN)
+    if (due := float(errors.mean())) > bound * stated:
         notes.append(Note(
             "frames.offset", "how much more light the pixels see than the frames show is hardly "
             f"determined ({optics.offset_dn:.0f} ± {optics.offset_dn_std:.0f} DN), and by itself "

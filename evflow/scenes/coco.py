@@ -75,7 +75,8 @@ class Coco:
             there = sum((self.folder / n).is_file() for n in names)
             raise EvflowDataError(
                 "EV016", f"{self.path} names {name}, which is not in {self.folder} ({there:,} of "
-                f"{len(names):,} images are).", "Pass the folder of the images: images=...")
+                f"{len(names):,} images are).", f"Move the images there, or into "
+                f"{self.path.parent / 'images'}; in Python, images= is their folder.")
         return path
 
 

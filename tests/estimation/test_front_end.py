@@ -106,7 +106,7 @@ def test_a_dead_time_and_what_is_lost_in_it_go_together(
     found: Any = SimpleNamespace(std=np.array([2.0, 5e-4, 1e-3]))
 
     def front_end(law: Any, dead_s: float) -> FrontEnd:
-        lost = law and Lost(law, dead_s, np.array([1.2, 1.2]), np.array([0.2, 0.2]))
+        lost = law and Lost(law, dead_s, np.array([1.2, 1.2]), np.array([0.2, 0.2]), 0.1)
         return FrontEnd(found=found, dead=DeadTime(dead_s, 1e-4), lost=lost)
 
     before, now = front_end(first, 2e-3), front_end(second, 3e-3)

@@ -43,12 +43,15 @@ def test_thresholds_from_rolling_frames_are_less_certain() -> None:
     assert thetas(with_rolling_error(SUMMARY, STD, 1.0))[0] == pytest.approx(0.0316, rel=0.01)
 
 
-def test_what_is_open_of_offset_and_map_is_in_the_errors_of_thresholds() -> None:
+def test_what_is_open_of_offset_map_and_loss_is_in_the_errors_of_thresholds() -> None:
     ideal = found(0.9)
     assert thetas(maps._with_open(SUMMARY, STD, ideal)) == pytest.approx([0.01, 0.02])
     open_ = dataclasses.replace(ideal, offset_open=np.array([0.05, 0.08]))
     assert thetas(maps._with_open(SUMMARY, STD, open_)) == pytest.approx(
         [np.hypot(0.01, 0.01), np.hypot(0.02, 0.02)])
+    losing = dataclasses.replace(open_, loss_open=np.array([0.1, 0.0]))
+    assert thetas(maps._with_open(SUMMARY, STD, losing)) == pytest.approx(
+        [np.sqrt(2e-4 + 4e-4), np.hypot(0.02, 0.02)], rel=1e-5)
     both = dataclasses.replace(open_, other_map=OtherMap(0.25, np.exp([0.1, 0.0])))
     assert thetas(maps._with_open(SUMMARY, STD, both)) == pytest.approx(
         [np.sqrt(2e-4 + 1e-4), np.hypot(0.02, 0.02)], rel=1e-5)
@@ -94,9 +97,9 @@ def test_all_but_the_thresholds_are_left() -> None:
     assert same == SUMMARY
 
 
-def lost_by_reset(on: float) -> Lost:
+def lost_by_reset(on: float, unexplained: float = 0.0) -> Lost:
     """SUMMARY's thresholds, too high by 1.25 (ON) and right (OFF); a regression that says `on`."""
-    return Lost("resets", 2e-3, np.array([1.25, 1.0]), np.array([on, 0.25]))
+    return Lost("resets", 2e-3, np.array([1.25, 1.0]), np.array([on, 0.25]), unexplained)
 
 
 def test_thresholds_of_pixels_that_lose_contrast_are_lowered_and_their_errors_grow() -> None:
@@ -122,6 +125,9 @@ def test_where_counts_and_regression_disagree_about_a_loss_both_count_and_errors
     assert 0.11 < apart[0] < 0.15
     assert apart[1] > 3 * alike[1]
     assert lost_by_reset(0.1).corrected(0, 0.2, np.nan)[0] < 0.16
+    unclear = lost_by_reset(0.16, 0.2).corrected(0, 0.2, 0.002)
+    assert unclear[0] == pytest.approx(0.16)
+    assert unclear[1] > 1.5 * alike[1]
     assert np.isnan(lost_by_reset(0.1).corrected(0, 0.2, np.nan)[1])
 
 

@@ -22,13 +22,15 @@ STD = Summary(*(np.float32(v) for v in (0.01, 0.0125, 0.03, 0.04, 0.005, 0.006))
 
 def told(
     offset_dn: float, std_dn: float, due: float, log_map: LogMap = "linlog",
-    other: OtherMap | None = None,
+    other: OtherMap | None = None, loss: float = 0.0,
 ) -> dict[str, str]:
-    """The notes, by code, where what is open of the offset changes theta by the share `due`."""
+    """The notes, by code, where what is open of the offset changes theta by the share `due`, and a
+    loss of contrast by `loss`."""
     seen = Photoreceptor(offset_dn, log_map=log_map)
     found = Found(
         seen, np.full(2, 0.3), np.full(2, 0.3), np.diag([std_dn**2, 1e-8, 1e-8]), np.full(2, due),
-        (0.9, 0.9), 0.1, 0.0, 400.0, np.zeros((2, 3)), np.zeros((2, 2)), other, np.full(2, due))
+        (0.9, 0.9), 0.1, 0.0, 400.0, np.zeros((2, 3)), np.zeros((2, 2)), other, np.full(2, due),
+        np.full(2, loss))
     optics = Optics(offset_dn, 0.0, std_dn, 1e-4)
     return {note.code: note.text
             for note in receptor_notes(found, optics, SUMMARY, STD, sought=True)}
@@ -61,6 +63,11 @@ def test_a_logarithm_that_the_light_leaves_open_is_told(chance: float, told_so: 
         assert "-50 % (ON) and -55 % (OFF)" in notes["pixels.map"]
         swapped = told(0.0, 1.0, 0.01, "log_eps", OtherMap(chance, np.array([2.0, 2.0])))
         assert "logarithmic, as ESIM's, and may be lin-log" in swapped["pixels.map"]
+
+
+def test_contrast_that_may_be_lost_is_told() -> None:
+    assert "some 12% lower" in told(0.0, 1.0, 0.01, loss=0.12)["pixels.losing"]
+    assert "pixels.losing" not in told(0.0, 1.0, 0.01, loss=0.002)
 
 
 @pytest.mark.parametrize(("delay_s", "way"), [(4e-3, "after"), (-4e-3, "before"), (2e-3, "")])

@@ -51,7 +51,8 @@ class Found:
     over it, and changes of log theta_on and log theta_off; curve: (K, 2) CUTOFFS in Hz, and the
     share explained with each, offset and delay as found; other_map: None where the maps do not
     differ; offset_open: (2,) relative errors of the ideal pixel's theta due to an offset that may
-    be there, 0 where it is not ideal."""
+    be there, 0 where it is not ideal; loss_open: of theta due to contrast that may be lost in a
+    dead time, 0 where it is taken out (lost_contrast.py)."""
 
     seen: Photoreceptor
     theta: np.ndarray
@@ -66,6 +67,12 @@ class Found:
     curve: np.ndarray
     other_map: OtherMap | None = None
     offset_open: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(2))
+    loss_open: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(2))
+
+    @property
+    def unexplained(self) -> float:
+        """Share of the variance that stays unexplained by what is used."""
+        return 1.0 - self.explained[int(self.needed)]
 
     @property
     def std(self) -> np.ndarray:

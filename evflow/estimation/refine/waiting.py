@@ -48,7 +48,7 @@ def kept_contrast(data: Sample, found: Found, dead_s: float) -> Lost | None:
         excess = np.maximum(excess * more**0.7, 1.0)
     if np.abs(np.log(excess)).max() < NEGLIGIBLE:
         return None
-    return Lost("keeps", dead_s, excess, found.theta)
+    return Lost("keeps", dead_s, excess, found.theta, found.unexplained)
 
 
 def _counted(paths: list[tuple[Array, float]], theta: Array, model: SensorModel) -> Array:

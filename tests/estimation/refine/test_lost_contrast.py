@@ -74,6 +74,25 @@ def test_a_reset_that_sums_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_allclose(lost.theta, [0.25, 0.2], rtol=0.15)
 
 
+@pytest.mark.parametrize(("law", "edge_s"), [("resets", 0.0), ("drops", DEAD_S)])
+def test_a_loss_that_is_not_certain_widens_the_errors(
+    law: str, edge_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dn, dt_s = film(), FRAME_S / STEPS
+    seen = integrated(dn, dt_s, 0.0, 0.0, SUB)
+    monkeypatch.setattr(lost_module, "CLEARLY", np.inf)
+    monkeypatch.setattr(lost_module, "SURELY", np.inf)
+    loses = sample_of(dn, dead_events(seen, dt_s / SUB, law))
+    found, lost = lost_contrast(loses, find(loses), 1.3 * DEAD_S, edge_s)
+    assert lost is None
+    theta = found.theta if found.needed else found.ideal_theta
+    assert (np.abs(np.log(theta / [0.25, 0.2])) < 1.5 * found.loss_open).all()
+    keeps = sample_of(dn, events_of(seen, dt_s / SUB, 0.0, 0.25, 0.2))
+    found, lost = lost_contrast(keeps, find(keeps), 1.3 * DEAD_S, edge_s)
+    assert lost is None
+    assert found.loss_open.max() < 0.01
+
+
 def test_events_that_waited_for_their_dead_time_do_not_count_as_crossings() -> None:
     """Their light has gone on: it looks like a slow photoreceptor, and like frames with a delay."""
     dn, dt_s = view(), FRAME_S / STEPS
@@ -137,7 +156,9 @@ def test_thresholds_that_are_none_say_nothing_of_a_loss(monkeypatch: pytest.Monk
     monkeypatch.setattr(lost_module, "_solved", lambda *a: (
         solved(*a)[0] * np.array([1.0, -1.0]), solved(*a)[1]))
     kept = find(data)
-    assert lost_contrast(data, kept, DEAD_S, DEAD_S) == (kept, None)
+    again, lost = lost_contrast(data, kept, DEAD_S, DEAD_S)
+    assert lost is None
+    np.testing.assert_array_equal(again.loss_open, 0.0)
 
 
 def test_too_few_events_and_no_thresholds_say_nothing_of_what_is_never_sent() -> None:
