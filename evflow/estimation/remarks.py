@@ -109,8 +109,8 @@ def receptor_notes(
     if (due := float(found.loss_open.mean())) > OPEN * stated:
         notes.append(Note(
             "pixels.losing", "pixels may lose contrast in a dead time, which is not certain enough "
-            f"to be taken out: thresholds would be some {due:.0%} lower, which their errors "
-            "include. A recording with more fast motion of clear contrast tells."))
+            "to be taken out: thresholds would then be lower, for which their errors include "
+            f"{due:.0%}. A recording with more fast motion of clear contrast tells."))
     if abs(optics.offset_dn) > 2.0 * optics.offset_dn_std:
         more = "more" if optics.offset_dn > 0 else "less"
         notes.append(Note(
